@@ -12,13 +12,21 @@ import pytest
 from arview.cad.model import Component, Model, make_model
 from arview.cad.part import ComponentSettings, Part
 from arview.geometry import Array, apply, exp_so3, rigid
-from arview.inspection import ComponentDeviation, Inspection, Provenance, Verdict, load_inspection, save_inspection
+from arview.inspection import (
+    ComponentDeviation,
+    Inspection,
+    MeasuredPresence,
+    Provenance,
+    Verdict,
+    load_inspection,
+    save_inspection,
+)
 from arview.measurement.datums.alignment import Alignment, align
 from arview.measurement.datums.equations import move_equations
 from arview.measurement.measurand import measurand_of
-from arview.measurement.options import ComponentMeasurement, MeasureOptions
+from arview.measurement.options import METHODS, ComponentMeasurement, MeasureOptions
 from arview.measurement.records import component_record
-from arview.measurement.types import Method, Move
+from arview.measurement.types import Method, Move, NotMeasured
 from arview.measurement.uncertainty.budget import UncertaintyOptions
 from helpers.cad_files import box
 from helpers.synthetic import post
@@ -163,6 +171,22 @@ def test_methods_that_contradict_each_other_are_never_a_pass() -> None:
     assert recorded(sweep, loose, tolerance_deg=None).verdict is Verdict.PASS
     cloud = move("block", np.zeros(3), np.array([0.02, 0.3, 0.0]), "cloud")
     assert recorded(sweep, near, cloud, tolerance_deg=None).verdict is Verdict.PASS  # only for comparison
+
+
+def test_missing_is_told_from_not_seen() -> None:
+    of = part()
+
+    def found(*failures: NotMeasured) -> ComponentDeviation:
+        measured = ComponentMeasurement((), failures)
+        return component_record("block", measured, measurand_of("block", of), frame(), None, of, OPTIONS)
+
+    few = [NotMeasured("block", method, "fewer than 3 photos", is_unseen=True) for method in METHODS[:2]]
+    unseen = found(*few)
+    assert unseen.presence is MeasuredPresence.NOT_SEEN and unseen.verdict is Verdict.NOT_MEASURED
+    doubtful = found(NotMeasured("block", "sweep", "weak", is_unseen=True), NotMeasured("block", "edges", "elsewhere"))
+    assert doubtful.presence is MeasuredPresence.UNKNOWN and doubtful.finding is None
+    gone = found(NotMeasured("block", "edges", "missing", is_missing=True))
+    assert gone.presence is MeasuredPresence.MISSING and gone.verdict is Verdict.FAIL
 
 
 def test_the_record_is_written_and_read(tmp_path: Path) -> None:

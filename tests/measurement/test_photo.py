@@ -121,13 +121,14 @@ def test_round_post_has_a_place_but_no_spin(method: Method) -> None:
 
 
 @cache
-def painted() -> dict[str, dict[Method, Move | NotMeasured]]:
-    """Blocks of one grey on a darker plate: no texture at all. One of them is 32 mm from its place."""
+def painted(is_there: bool = True) -> dict[str, dict[Method, Move | NotMeasured]]:
+    """Blocks of one grey on a darker plate: no texture at all. One of them is 32 mm from its place, or missing."""
 
     def paint(points: Array, seed: int) -> Array:
         return np.where(points[:, 2] > 0.01, 150.0, np.where(points[:, 2] > -7.9, 70.0, 30.0))
 
-    places = PLACES | {"block_4": place_of(NOMINAL, "block_4", (25.0, -20.0, 0.0), (0.0, 0.0, 0.0))}
+    away = place_of(NOMINAL, "block_4", (25.0, -20.0, 0.0), (0.0, 0.0, 0.0))
+    places = PLACES | {"block_4": away if is_there else None}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(photo_scene, "_texture", paint)
         views = views_on(NOMINAL, displaced(NOMINAL, places), 10)
@@ -150,6 +151,17 @@ def test_without_texture_edges_still_measure(name: str) -> None:
 def test_out_of_range_gives_no_number(method: Method) -> None:
     found = painted()["block_4"][method]
     assert isinstance(found, NotMeasured), found
+
+
+def test_missing_without_texture() -> None:
+    """None of its edges is seen while those of the others are; what stands 32 mm away is not taken for missing."""
+    for method in METHODS:
+        found = painted(is_there=False)["block_4"][method]
+        assert isinstance(found, NotMeasured) and found.is_missing, found
+        assert found.reason.startswith("missing, or far from its place: none of its edges is seen")
+        elsewhere = painted()["block_4"][method]
+        assert isinstance(elsewhere, NotMeasured) and not elsewhere.is_missing
+    assert all(isinstance(painted(is_there=False)[name]["edges"], Move) for name in BLOCKS[:3])
 
 
 def test_samples_of_a_plane_say_where_it_is() -> None:

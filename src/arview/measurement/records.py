@@ -21,6 +21,7 @@ from arview.inspection import (
     Details,
     FailedDatum,
     Finding,
+    MeasuredPresence,
     MethodAgreement,
     MethodResult,
     Provenance,
@@ -59,9 +60,12 @@ def component_record(
         reasons = tuple(dict.fromkeys(f.reason for f in measured.failures))
         details = Details(_three(center), measurand.kind, methods=failures, notes=reasons)
         verdict, finding = (Verdict.FAIL, Finding.MISSING) if is_missing else (Verdict.NOT_MEASURED, None)
+        is_unseen = not is_missing and all(f.is_unseen for f in measured.failures if f.method != "cloud")
+        presence = MeasuredPresence.NOT_SEEN if is_unseen else MeasuredPresence.UNKNOWN
         return ComponentDeviation(
-            name, (None, None, None), None, nothing, None, tolerance_mm, verdict, finding=finding, details=details
-        )
+            name, (None, None, None), None, nothing, None, tolerance_mm, verdict, finding=finding, details=details,
+            presence=MeasuredPresence.MISSING if is_missing else presence,
+        )  # fmt: skip
     by_poses = None if poses is None else poses.covariance_of(component, center)
     together = together.at(center)
     moves = [move.at(center) for move in measured.moves]
@@ -91,6 +95,7 @@ def component_record(
         verdict=verdict,
         tilt_deg=tilt_deg,
         twist_deg=twist_deg,
+        presence=MeasuredPresence.PRESENT,
         details=replace(
             _details(placed, together, measurand, settings), methods=methods, notes=tuple(notes),
             agreement=tuple(

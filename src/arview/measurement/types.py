@@ -110,9 +110,20 @@ def moved_to(
 
 @dataclass(frozen=True)
 class NotMeasured:
-    """A component that a method could not measure or found missing, with the reason as a message."""
+    """A component that a method could not measure or found missing.
+
+    Attributes:
+        component: its name.
+        method: method of measurement.
+        reason: as a message.
+        is_missing: what it would hide is seen, or nothing of it is.
+        is_unseen: too few photos show its place, so that nothing is known of it.
+        support: share of its predicted edges that were found beyond chance, where this is the reason; else None.
+    """
 
     component: str
     method: Method
     reason: str
     is_missing: bool = False
+    is_unseen: bool = False
+    support: float | None = None

@@ -169,7 +169,8 @@ class ComponentEdges:
         place = np.eye(4) if start is None else start
         edges = self.predicted(place)
         if len(edges.points) < o.min_points or len(np.unique(edges.view)) < 3:
-            return self._not("fewer than 3 photos show enough of its edges; take more photos of it")
+            reason = "fewer than 3 photos show enough of its edges; take more photos of it"
+            return NotMeasured(self.body.shape.name, "edges", reason, is_unseen=True)
         # Start on reduced pictures where a pixel is much smaller than the displacements searched for.
         levels = [k for k in (2, 1) if self.body.px_mm * 2.0**k < 0.6]
         rounds = [(k, 6.0) for k in levels] + [(0, reach) for reach in o.reaches_px]
@@ -193,7 +194,8 @@ class ComponentEdges:
         support = self._support(edges, place)
         used = int(np.count_nonzero(fit.weights > 0.1))
         if support < o.min_support or used < o.min_points or len(fit.undetermined) == 6:
-            return self._not(f"its edges are not seen where they should be: {100 * support:.0f} % more than by chance")
+            reason = f"its edges are not seen where they should be: {100 * support:.0f} % more than by chance"
+            return NotMeasured(self.body.shape.name, "edges", reason, support=support)
         by_poses = pose_gain(self.views, fit, edges.view[ok], found.pose_rows[ok])
         return self.body.move("edges", fit, by_poses, place, o.systematic_px * self.body.px_mm, support)
 

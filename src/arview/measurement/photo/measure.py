@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
@@ -62,7 +62,31 @@ def measure_components_in_photos(
         results[name] = job.result()
         if progress is not None:
             progress(name, done / len(jobs))
-    return results
+    return {name: _absent_if_no_edges(found, results, options) for name, found in results.items()}
+
+
+def _absent_if_no_edges(
+    found: MethodResults, results: Mapping[str, MethodResults], options: PhotoOptions
+) -> MethodResults:
+    """The result of a component as missing, if none of its edges is seen while those of others are seen well.
+
+    This finds what is missing from surfaces without texture. The photos must show where it should be, and neither
+    method may have measured it.
+    """
+    edges = found.get("edges")
+    if not isinstance(edges, NotMeasured) or edges.is_missing or isinstance(found.get("sweep"), Move):
+        return found
+    if edges.support is None or edges.support > options.absent_support:
+        return found
+    others = [one.get("edges") for one in results.values() if one is not found]
+    clear = sum(isinstance(one, Move) and one.support > options.clear_support for one in others)
+    if clear < options.min_clear:
+        return found
+    reason = (
+        "missing, or far from its place: none of its edges is seen where it should be"
+        f" ({100 * edges.support:.0f} % more than by chance), while those of {clear} others are"
+    )
+    return {method: NotMeasured(edges.component, method, reason, is_missing=True) for method in found}
 
 
 def measure_component(views: PhotoViews, index: int, part: Part | None, options: PhotoOptions) -> MethodResults:

@@ -62,4 +62,7 @@ class PhotoOptions:
     edges: EdgeOptions = EdgeOptions()
     joint_mm: float = 4.0  # surfaces and edges this near to another component are dropped: welds, gaps, shadows
     undetermined_mm: float = 0.3  # largest standard deviation of a determined direction; rotations at the rim
+    absent_support: float = 0.1  # share of a component's edges found below which nothing of it is there
+    clear_support: float = 0.5  # share of other components' edges found for the photos to show what is there
+    min_clear: int = 3  # components whose edges are found so well that one without any edges is missing
     gone_share: float = 0.6  # a component is missing when more than this share of what it would hide is visible

@@ -269,7 +269,8 @@ class ComponentSweep:
         chosen = self._pick(np.eye(4))
         seen = np.count_nonzero(chosen >= 0, axis=1) >= o.min_views
         if np.count_nonzero(seen) < o.min_samples:
-            return self._not(f"fewer than {o.min_views} photos show it well enough; take more photos of it")
+            reason = f"fewer than {o.min_views} photos show it well enough; take more photos of it"
+            return NotMeasured(self.body.shape.name, "sweep", reason, is_unseen=True)
         patches, is_on = self._cut(o.patch_points, o.patch_px / o.patch_points * self.body.px_mm)
         shades = shades_of(is_on)
         places = [self._coarse(chosen, seen), *starts]
