@@ -167,7 +167,7 @@ def test_truth_lies_on_the_photos_edges(kind, part, truth):
             offset, strength = edges.gradient_offsets(picture, pixel[inside], normal[inside])
             shift = edges.common_shift(offset[strength > 12], normal[inside][strength > 12])
             # Edges hidden by the part itself find other edges, which follow a shift less.
-            limit_px = 0.15 + 0.2 * wrong_px
+            limit_px = 0.2 + 0.1 * wrong_px
             assert max(abs(shift[0] + wrong_px), abs(shift[1])) < limit_px, f"{name}: {shift} px"
 
 
