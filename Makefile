@@ -19,7 +19,7 @@ help:
 	@echo "make soak      run the live server for ten minutes, and check its memory and the age of frames"
 	@echo "make clean     remove what these targets made, except .venv"
 
-$(READY): pyproject.toml tools/setup
+$(READY): pyproject.toml $(wildcard requirements.lock) tools/setup
 	tools/setup
 	@touch $@
 

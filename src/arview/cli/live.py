@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from arview.live.server.live_server import LiveServer
     from arview.live.stream.subjects import Subjects
 
-STOP_DEADLINE_S = 4.0
+STOP_DEADLINE_S = 4.6
 """Time from a signal to the end of the program, whatever its workers do."""
 EXTRA = ("aiortc", "starlette", "uvicorn", "cryptography", "segno")
 _AGES_S = {"min": 60.0, "h": 3600.0, "d": 86400.0}

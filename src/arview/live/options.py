@@ -134,7 +134,7 @@ class LiveOptions:
     reload_interval_s: float = 1.0  # time between two checks of the inspection file
     renewal_interval_s: float = 12 * 3600.0  # time between two checks of the age of the certificate
     worker_timeout_s: float = 30.0  # a thread for drawing, JPEG or files that takes longer is given up and replaced
-    closing_timeout_s: float = 1.5  # at the end, time for each of pages, camera and tracking to close
+    closing_timeout_s: float = 1.2  # at the end, time for each of pages, camera and tracking to close
     workers: int = 16  # threads for drawing, JPEG and files; most of them wait for a renderer
     feed: FeedOptions = field(default_factory=FeedOptions)
     station: StationOptions = field(default_factory=StationOptions)

@@ -23,7 +23,7 @@ ROOT = Path(__file__).resolve().parents[3]
 HERE = Path(__file__).resolve().parent
 sys.path[:0] = [str(ROOT / "tests"), str(HERE)]
 
-SLICE_S = 60.0
+SLICE_S = 20.0
 DEADLINE_S = 900.0
 
 
@@ -40,7 +40,9 @@ def run_worker(name: str, seed: int, examples: int | None, seconds: float, folde
     command = [sys.executable, str(HERE), "--worker", name, "--seed", str(seed), "--seconds", str(seconds)]
     command += ["--folder", str(folder), *(["--examples", str(examples)] if examples else [])]
     try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=seconds + DEADLINE_S, check=False)
+        done = subprocess.run(
+            command, capture_output=True, text=True, errors="replace", timeout=seconds + DEADLINE_S, check=False
+        )
     except subprocess.TimeoutExpired:
         return {"inputs": 0, "faults": [[f"{name} process hangs", f"seed {seed}"]]}
     lines = done.stdout.strip().splitlines()
@@ -91,7 +93,7 @@ def main() -> int:
             break
         seed += 1
         print(f"{sum(inputs.values())} inputs, {len(faults)} faults", flush=True)
-    print("inputs by target: " + ", ".join(f"{name} {count}" for name, count in inputs.items()))
+    print(f"{len(names)} targets: " + ", ".join(f"{name} {count}" for name, count in inputs.items()))
     print(f"{sum(inputs.values())} inputs, {len(faults)} faults" + (f"; inputs in {folder}" if faults else ""))
     return 1 if faults or not all(inputs.values()) else 0
 

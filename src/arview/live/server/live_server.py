@@ -164,9 +164,9 @@ class LiveServer:
         finally:
             loaded.cancel()
             stopped.cancel()
-            await hub.close()
             for server in servers:
                 server.stop()
+            await hub.close()
             tasks[-1].cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
 
