@@ -1,8 +1,9 @@
 """Occluders: what lies before the part, as a hand or a tool, found by its colour against the appearance expected.
 
 The colour of the surface is learned while the part is tracked, in cells of a grid that is fixed to the model. A pixel
-whose colour differs clearly from that of its cell, after the exposure of the frame is accounted for, belongs to an
-occluder if most of its neighbours do. It follows the background subtraction of Stauffer and Grimson ("Adaptive
+whose colour differs from that of its cell, after the exposure of the frame is accounted for, or around which the ratio
+of seen to expected brightness changes abruptly, belongs to an occluder if most of its neighbours do: light and shadows
+change that ratio smoothly, the edges and highlights of a thing before the part do not. It follows the background subtraction of Stauffer and Grimson ("Adaptive
 background mixture models for real-time tracking", CVPR 1999), with one mode for each cell and the surface of the part
 as background. Occluders that were there before the surface was seen, or of its colour, are not found.
 """
@@ -34,14 +35,15 @@ _HIDDEN_SHARE = 0.6
 """Share of these pixels that an occluder of a hidden component covers."""
 _STEPS = (2, 3, 4, 6, 8, 12, 16)
 """Distances of the samples, px."""
-_BORDER_LEVEL = np.uint8(250)
-"""Level of an occluder between whose samples and others the border is interpolated, at a level of 30."""
+_BORDER_LEVEL, _BORDER = np.uint8(250), 100
+"""Level of an occluder between whose samples and others the border is interpolated, and the level of the border."""
 _DARK = 12.0
 """Grey level of darker colours, which say nothing about the exposure."""
 _MAX_CHANGE = 0.25
 """Logarithm of the largest change of exposure between two frames."""
 _EXPOSURE_STRIDE = 5
 """Every so many samples are used for the exposure."""
+_SQUARE = np.ones((3, 3), dtype=np.uint8)
 _MIN_AGREEING = 0.1
 """Share of the samples that must agree on the exposure; with fewer it is taken to be as before."""
 
@@ -59,23 +61,30 @@ class OccluderOptions:
         shade, shine: factors of the brightness between which shading, shadows and reflections explain a difference.
         max_variance: of hue and brightness in a cell, squared grey levels; more would make it blind.
         min_score: squared normalised difference of colours from which on a pixel looks like an occluder.
+        sure_score: the same of pixels of which every occluder must have some.
+        min_contrast: standard deviation, among neighbours, of the logarithm of seen to expected brightness from which
+            on there is an edge that the surface does not have.
         min_share: share of neighbours that must look so, too.
         min_samples: samples of an occluder, at least.
+        min_sure_share: share of them that must be sure.
         rate: weight of a new colour in a cell that was seen often.
         occluded_rate: the same where an occluder was found: what stays is learned in the end.
     """
 
     cells: int = 72
-    samples: int = 3500
+    samples: int = 9000
     min_observations: int = 6
     hue_noise: float = 4.0
     noise: float = 8.0
     shade: float = 0.85
     shine: float = 1.25
     max_variance: float = 150.0
-    min_score: float = 6.0
-    min_share: float = 0.55
+    min_score: float = 1.0
+    sure_score: float = 6.0
+    min_contrast: float = 0.25
+    min_share: float = 0.6
     min_samples: int = 10
+    min_sure_share: float = 0.15
     rate: float = 0.04
     occluded_rate: float = 0.002
 
@@ -145,7 +154,7 @@ class OccluderFinder:
         mask |= cv2.dilate(mask, np.ones((3, 3), dtype=np.uint8)) & (cells < 0)
         large = cv2.resize(_BORDER_LEVEL * mask, size, interpolation=cv2.INTER_LINEAR)
         top, left = view.v0 % step, view.u0 % step
-        return np.asarray(large[top : top + height, left : left + width] >= 30)
+        return np.asarray(large[top : top + height, left : left + width] >= _BORDER)
 
     def _ray_grid(self, step: int) -> Array:
         """Rays (h,w,2), x and y at z = 1, through the middles of squares of ``step`` pixels of the image."""
@@ -167,20 +176,26 @@ class OccluderFinder:
         """Samples that look like an occluder by themselves, and those that belong to one."""
         options, table = self._options, self._cells.reshape(-1, _COLUMNS)
         noise = np.array([options.hue_noise, options.noise, options.shade, options.shine], dtype=np.float32)
-        hue, hue_variance, brightness_score = _differences(table, cells, observed, known, gain, noise)
+        hue, hue_variance, brightness_score, ratio = _differences(table, cells, observed, known, gain, noise)
         # What the frame as a whole differs by, as under another light, is not an occluder. Most of the part may be
         # hidden, so this is judged by the samples that agree best.
         seen = hue[known]
         common = 2.0 * float(np.partition(seen, len(seen) // 5)[len(seen) // 5])
         score = np.maximum(hue / (hue_variance + common), brightness_score)
-        strange = (known & (score > options.min_score)).astype(np.float32)
-        near = cv2.blur(strange, (3, 3)) / np.maximum(cv2.blur(known.astype(np.float32), (3, 3)), 1e-3)
-        candidate = ((near >= options.min_share) & (cells >= 0)).astype(np.uint8)
+        is_strange = known & (score > options.min_score)
+        is_part, weight = cells >= 0, known.astype(np.float32)
+        is_edge = known & (_local_deviation(ratio, weight) > options.min_contrast)
+        near = cv2.blur((is_strange | is_edge).astype(np.float32), (3, 3)) / np.maximum(cv2.blur(weight, (3, 3)), 1e-3)
+        wide = cv2.morphologyEx(((near >= options.min_share) & is_part).astype(np.uint8), cv2.MORPH_CLOSE, _SQUARE) > 0
+        # A deviation reaches one sample beyond the edge that causes it.
+        core = cv2.erode((wide | ~is_part).astype(np.uint8), _SQUARE) > 0
+        candidate = (wide & is_part & (core | is_strange)).astype(np.uint8)
         count, labels, stats, _ = cv2.connectedComponentsWithStats(candidate, connectivity=8)
-        kept = np.zeros(count, dtype=np.uint8)
-        kept[1:] = stats[1:, cv2.CC_STAT_AREA] >= options.min_samples
-        found = kept[labels]
-        return strange.astype(np.uint8), np.asarray(found, dtype=np.uint8)
+        sure = np.bincount(labels[known & (score > options.sure_score)], minlength=count)
+        area = stats[:, cv2.CC_STAT_AREA]
+        kept = (area >= options.min_samples) & (sure >= options.min_sure_share * area)
+        kept[0] = False
+        return is_strange.astype(np.uint8), kept[labels].astype(np.uint8)
 
 
 class HiddenComponents:
@@ -217,6 +232,14 @@ class HiddenComponents:
         self._frames = np.clip(self._frames + step, 0, _HIDDEN_FRAMES)
         self.flags |= self._frames == _HIDDEN_FRAMES
         self.flags &= self._frames > 0
+
+
+def _local_deviation(values: NDArray[np.float32], weight: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Standard deviation (R,C) of the values of the 3×3 neighbours that have a weight."""
+    total = np.maximum(cv2.blur(weight, (3, 3)), 1e-3)
+    mean = cv2.blur(values, (3, 3)) / total
+    variance = cv2.blur(values * values, (3, 3)) / total - mean * mean
+    return np.asarray(np.sqrt(np.maximum(variance, 0.0)), dtype=np.float32)
 
 
 def _exposure(
@@ -281,16 +304,18 @@ def _sample(
 def _differences(
     table: NDArray[np.float32], cells: NDArray[np.int64], observed: NDArray[np.float32], known: NDArray[np.bool_],
     gain: NDArray[np.float32], noise: NDArray[np.float32]
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:  # fmt: skip
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:  # fmt: skip
     """Squared difference (R,C) of the hue of each sample from its cell, its variance, and the score of the brightness.
 
     The hue is what is left of the colour at the same brightness. ``noise``: of hue and brightness, and the factors
-    between which a brightness is explained by the light.
+    between which a brightness is explained by the light. The last result is the logarithm of the ratio of seen to
+    expected brightness, 0 where nothing is known and damped where noise is a large part of the expected brightness.
     """
     rows, columns = cells.shape
     hue = np.zeros((rows, columns), dtype=np.float32)
     variance = np.ones((rows, columns), dtype=np.float32)
     score = np.zeros((rows, columns), dtype=np.float32)
+    ratio = np.zeros((rows, columns), dtype=np.float32)
     for row in range(rows):
         for column in range(columns):
             if not known[row, column]:
@@ -309,7 +334,10 @@ def _differences(
             variance[row, column] = noise[0] * noise[0] + np.float32(2.0) * table[cell, 3]
             excess = (light - min(max(light, noise[2]), noise[3])) * mean
             score[row, column] = excess * excess / (noise[1] * noise[1] + np.float32(2.0) * table[cell, 4])
-    return hue, variance, score
+            spread = np.float32(9.0) * (np.float32(0.25) * noise[1] * noise[1] + table[cell, 4])
+            damping = mean / np.sqrt(mean * mean + spread)
+            ratio[row, column] = damping * np.log(min(max(light, np.float32(0.05)), np.float32(20.0)))
+    return hue, variance, score, ratio
 
 
 @kernel

@@ -92,8 +92,8 @@ class SeveralOverlay:
         Raises:
             MismatchError: the image is not of the camera's size.
         """
-        frame = np.array(image, order="C")
-        canvas = image if in_place else frame.copy()
+        canvas = image if in_place else np.array(image, order="C")
+        frame = self._unpainted(image, canvas, pose)
         for one in pose:
             self.renderers[one.instance].draw_part(canvas, one, now, frame)
         bottom_px = min(self.renderers[one.instance].draw_legend(canvas) for one in pose)
@@ -105,6 +105,14 @@ class SeveralOverlay:
         for number, one in enumerate(pose):
             self.renderers[one.instance].draw_state(canvas, one, fps if number == 0 else None, now)
         return canvas
+
+    def _unpainted(self, image: paint.Image, canvas: paint.Image, poses: Sequence[Pose]) -> paint.Image | None:
+        """The picture in which occluders of the second and later parts are searched; None if none are searched."""
+        renderers = [self.renderers[one.instance] for one in poses if one.cam_from_model is not None]
+        if not any(one.options.show_occlusion for one in renderers[1:]):
+            return None
+        # An image that is not drawn on stays as it is.
+        return image.copy() if canvas is image else np.ascontiguousarray(image)
 
     def _wanted(self, poses: Sequence[Pose]) -> WantedLabels | None:
         """Labels of all specimens, with their marks; the urgent ones of all come first."""
