@@ -3,7 +3,8 @@
 The colour of the surface is learned while the part is tracked, in cells of a grid that is fixed to the model. A pixel
 whose colour differs from that of its cell, after the exposure of the frame is accounted for, or around which the ratio
 of seen to expected brightness changes abruptly, belongs to an occluder if most of its neighbours do: light and shadows
-change that ratio smoothly, the edges and highlights of a thing before the part do not. It follows the background subtraction of Stauffer and Grimson ("Adaptive
+change that ratio smoothly, the edges and highlights of a thing before the part do not. It follows the
+background subtraction of Stauffer and Grimson ("Adaptive
 background mixture models for real-time tracking", CVPR 1999), with one mode for each cell and the surface of the part
 as background. Occluders that were there before the surface was seen, or of its colour, are not found.
 """
