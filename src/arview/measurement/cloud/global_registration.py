@@ -18,6 +18,7 @@ from arview.core.parallel import pool
 from arview.errors import InputError
 from arview.geometry import Array, apply, exp_so3, invert, rigid
 from arview.measurement.cloud.mesh_surface import MeshSurface
+from arview.measurement.cloud.pair_registration import find_by_pairs
 from arview.measurement.cloud.registration import TUKEY_SIGMAS
 from arview.reconstruction.scale.similarity import Similarity
 from arview.reconstruction.types import DenseCloud
@@ -43,8 +44,11 @@ def find_model_in_cloud(
 ) -> Similarity:
     """Scale and rigid pose ``model_from_scan`` of the model in a cloud.
 
+    With a known scale the search goes by pairs of points (`pair_registration`), which finds a quarter of the part among
+    much else; with an unknown one by correlation, which needs a cloud of the part and little else.
+
     Args:
-        cloud: of the part and little else.
+        cloud: of the part.
         model: the nominal CAD.
         scale: mm per unit of the cloud, None when unknown.
         options: see `GlobalRegistrationOptions`.
@@ -53,12 +57,17 @@ def find_model_in_cloud(
         InputError: there are too few points, none fits, or two poses fit alike that are not related by a symmetry.
     """
     o = options or GlobalRegistrationOptions()
+    if scale:
+        own = np.asarray(cloud.points, dtype=np.float64) * scale
+        sound = np.isfinite(own).all(axis=1)
+        normals32 = np.nan_to_num(cloud.normals[sound]) if cloud.normals.any() else None
+        return Similarity(scale, find_by_pairs(own[sound], normals32, model).model_from_scan)
     points, normals, is_oriented = _some_points(cloud, o)
     vertices, faces, groups = model.mesh
     surface = MeshSurface(vertices, faces, groups)
     samples, of_face = surface.spread(o.points, o.seed)
     extent = float(np.linalg.norm(np.diff(np.quantile(points, [0.01, 0.99], axis=0), axis=0)))
-    scales = [scale] if scale else list(_ladder(model.diameter_mm / extent, o))
+    scales = list(_ladder(model.diameter_mm / extent, o))
     turns = _turns(normals, surface.face_normals[of_face], o)
     places = [
         job
@@ -71,7 +80,7 @@ def find_model_in_cloud(
     step = 0.8 * model.diameter_mm / o.voxels * _main_axes(surface.face_normals[of_face], 1)[0]
     tried = [(s, rigid(np.eye(3), k * step) @ pose) for _, s, pose in _separated(places, o) for k in (-1.0, 0.0, 1.0)]
     sides = normals if is_oriented else None
-    fits = list(pool().map(lambda job: _refined(points, sides, surface, samples, job, scale is None, limit_mm), tried))
+    fits = list(pool().map(lambda job: _refined(points, sides, surface, samples, job, True, limit_mm), tried))
     fits.sort(key=lambda fit: fit[0])
     cost, found_scale, pose = fits[0]
     around = _around(apply(pose, points * found_scale), samples, limit_mm)

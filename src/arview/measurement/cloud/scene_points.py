@@ -1,0 +1,187 @@
+"""A cloud prepared for the search of a part in it: thinned, without strays and the plane it stands on, with normals."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from arview.errors import InputError
+from arview.geometry import Array
+from arview.measurement.cloud.open3d_library import load_open3d
+
+
+@dataclass(frozen=True)
+class SceneOptions:
+    """Options of the preparation. Lengths are shares of the part's diameter unless named otherwise."""
+
+    max_points: int = 400_000  # points that are looked at, at random if there are more
+    coarse: float = 0.014  # cell of the grid for pairs
+    fine: float = 0.006  # cell of the grid for judging places
+    max_coarse: int = 9000  # points for pairs; with more the cells grow
+    normal_neighbours: int = 24  # points from which a normal is estimated
+    stray_neighbours: int = 12  # points whose mean distance tells strays
+    stray_sigmas: float = 3.0  # standard deviations above the mean distance
+    plane_tolerance: float = 0.004  # distance within which points are on a plane
+    plane_excess: float = 1.25  # a plane wider than the part by this factor is what it stands on
+    max_planes: int = 3  # planes that are removed
+    min_points: int = 200  # points that a cloud needs
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class ScenePoints:
+    """A prepared cloud.
+
+    Attributes:
+        points, normals, weights: (N,3), (N,3), (N,) evenly spread; points of large planes have small weights.
+        fine, fine_normals: (M,3) denser ones.
+        fine_mm: their spacing.
+        is_oriented: neighbouring normals agree in sign.
+        removed: points of planes wider than the part.
+    """
+
+    points: Array
+    normals: Array
+    weights: Array
+    fine: Array
+    fine_normals: Array
+    fine_mm: float
+    is_oriented: bool
+    removed: int
+
+
+def scene_points(
+    points: Array, normals: Array | None, diameter_mm: float, options: SceneOptions | None = None
+) -> ScenePoints:
+    """Prepare points (N,3) in mm, all finite, for the search of a part of a given diameter.
+
+    Raises:
+        InputError: too few points are left.
+    """
+    o = options or SceneOptions()
+    if len(points) < o.min_points:
+        raise InputError(
+            f"cloud: {len(points)} points are too few to find the part in it; at least {o.min_points} are needed"
+        )
+    if len(points) > o.max_points:
+        few = np.random.default_rng(o.seed).permutation(len(points))[: o.max_points]
+        points, normals = points[few], None if normals is None else normals[few]
+    has_normals = normals is not None and float(np.mean(np.linalg.norm(normals, axis=1) > 0.5)) > 0.9
+    kept = ~_strays(points, o)
+    points = points[kept]
+    own = normals[kept] if has_normals and normals is not None else None
+    estimated = _normals(points, o)
+    is_oriented = False
+    if own is not None:
+        sign = np.sign(np.sum(estimated * own, axis=1))
+        is_oriented = _is_consistent(points, own)
+        estimated = estimated * np.where(sign == 0.0, 1.0, sign)[:, None] if is_oriented else estimated
+    before = len(points)
+    on_table = wide_planes(points, estimated, diameter_mm, o)
+    points, estimated = points[~on_table], estimated[~on_table]
+    if len(points) < o.min_points:
+        raise InputError("cloud: the part was not found in it: the cloud is flat")
+    fine = _thin(points, o.fine * diameter_mm)
+    cell = o.coarse * diameter_mm
+    coarse = _thin(points, cell)
+    while len(coarse) > o.max_coarse:
+        cell *= 1.15
+        coarse = _thin(points, cell)
+    weights = plane_weights(points[coarse], estimated[coarse], 0.01 * diameter_mm)
+    return ScenePoints(
+        np.ascontiguousarray(points[coarse]), np.ascontiguousarray(estimated[coarse]), weights, points[fine],
+        estimated[fine], o.fine * diameter_mm, is_oriented, before - len(points),
+    )  # fmt: skip
+
+
+def wide_planes(points: Array, normals: Array, diameter_mm: float, options: SceneOptions | None = None) -> Array:
+    """(N,) bool, whether points are on a plane that is wider than the part, such as a table or a wall.
+
+    Planes are found by Open3D's RANSAC, on few points.
+    """
+    o = options or SceneOptions()
+    o3d = load_open3d()
+    out = np.zeros(len(points), dtype=bool)
+    few = _thin(points, 2.0 * o.coarse * diameter_mm)
+    tolerance = max(o.plane_tolerance * diameter_mm, 1e-6)
+    o3d.utility.random.seed(o.seed)
+    for _ in range(o.max_planes):
+        rest = few[~out[few]]
+        if len(rest) < 100:
+            break
+        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points[rest]))
+        plane, inliers = cloud.segment_plane(tolerance, 3, 600)
+        normal = np.asarray(plane[:3])
+        flat = points[rest[inliers]]
+        if len(flat) < 0.08 * len(rest):
+            break
+        axes = np.linalg.svd(flat - flat.mean(axis=0), full_matrices=False)[2]
+        size = np.ptp(np.quantile((flat - flat.mean(axis=0)) @ axes[:2].T, [0.03, 0.97], axis=0), axis=0)
+        is_wide = bool(np.linalg.norm(size) > o.plane_excess * diameter_mm)
+        near = np.abs(points @ normal + plane[3]) < tolerance
+        if not is_wide:
+            break
+        out |= near & (np.abs(normals @ normal) > 0.8)
+    return out
+
+
+def plane_weights(points: Array, normals: Array, tolerance: float, share: float = 0.02) -> Array:
+    """(N,) weights, small for points on large planes: a plane counts as much as a share of all points at most.
+
+    Points are on one plane if their normals agree within 8° and they are within ``tolerance`` of it.
+    """
+    weights = np.ones(len(points))
+    left = np.arange(len(points))
+    rng = np.random.default_rng(0)
+    limit = share * len(points)
+    for _ in range(60):
+        if len(left) < limit:
+            break
+        best = np.zeros(0, dtype=np.int64)
+        for index in rng.choice(left, size=min(24, len(left)), replace=False):
+            normal = normals[index]
+            away = np.abs((points[left] - points[index]) @ normal)
+            on = left[(away < tolerance) & (np.abs(normals[left] @ normal) > 0.99)]
+            best = on if len(on) > len(best) else best
+        if len(best) < limit:
+            break
+        weights[best] = limit / len(best)
+        left = np.setdiff1d(left, best, assume_unique=True)
+    return weights
+
+
+def _strays(points: Array, o: SceneOptions) -> Array:
+    """(N,) bool, points far from their neighbours, by Open3D's statistical outlier removal."""
+    o3d = load_open3d()
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
+    _, kept = cloud.remove_statistical_outlier(o.stray_neighbours, o.stray_sigmas)
+    out = np.ones(len(points), dtype=bool)
+    out[np.asarray(kept)] = False
+    return out
+
+
+def _normals(points: Array, o: SceneOptions) -> Array:
+    """(N,3) normals of planes through neighbours, by Open3D; their sign is arbitrary."""
+    o3d = load_open3d()
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
+    cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(o.normal_neighbours))
+    return np.array(cloud.normals)
+
+
+def _is_consistent(points: Array, normals: Array) -> bool:
+    """Whether the normals of neighbours have the same sign."""
+    few = np.random.default_rng(0).permutation(len(points))[:2000]
+    _, near = cKDTree(points).query(points[few], k=2)
+    cosine = np.sum(normals[few] * normals[near[:, 1]], axis=1)
+    cosine = cosine[np.abs(cosine) > 0.8]
+    return len(cosine) > 0 and float(np.mean(cosine > 0)) > 0.95
+
+
+def _thin(points: Array, cell: float) -> Array:
+    """Indices of one point for each cell of a grid."""
+    index = np.floor((points - points.min(axis=0)) / cell).astype(np.int64)
+    size = index.max(axis=0) + 1
+    _, first = np.unique((index[:, 0] * size[1] + index[:, 1]) * size[2] + index[:, 2], return_index=True)
+    return first
