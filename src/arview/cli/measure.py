@@ -35,6 +35,7 @@ Examples:
   arview measure out/ --part part.toml -o inspection.json --tolerance 0.5
   arview measure out/ --part plate.step --photos photos/ --methods edges --guard 0
   arview measure --cloud scan.ply --part part.toml
+  arview measure --cloud scan.csv --cloud-unit m --rescale --part part.toml
 
 \b
 OUT is the folder of `arview reconstruct --part`. If the part was not found there, or with --cloud, the
@@ -42,7 +43,12 @@ part is located by the shape of the cloud. Components of the role 'inspect' are 
 twice (sweep: by their surface; edges: by their edges) and in the cloud if there is one. Sweep and edges
 together give the result; the cloud is for comparison. Displacements are in the frame of the part file's
 datums. Degrees of freedom that the datums leave free, or all of them without datums, are fixed by the
-best fit of the base component. dx, dy and dz are the displacement of the centre of a component's
+best fit of the base component. A cloud alone is found in any frame, among other things and in
+part; what it does not show is not measured. If its scale contradicts the size of the base, the factor
+is named and U includes the difference; --rescale divides by it.
+
+\b
+dx, dy and dz are the displacement of the centre of a component's
 bounding box; ? means undetermined. U is the expanded uncertainty (k = 2; for small distances, chosen so
 that the interval holds the true distance with 95 % probability).
 
@@ -65,6 +71,9 @@ INSPECTION_distances: coloured PLY, a picture, histograms.""",
 @click.option("--cloud", "cloud_path", metavar="FILE",
               help="Measure a cloud instead, in any frame: PLY, PCD, XYZ, PTS, CSV, LAS, LAZ or E57.")  # fmt: skip
 @click.option("--cloud-unit", metavar="UNIT", help="Unit of the cloud: mm, cm, m, inch, ft, um; default: by its size.")
+@click.option(
+    "--rescale", is_flag=True, help="Divide the cloud by the factor by which it is larger than the CAD's base."
+)
 @click.option("--part", "part_path", required=True, metavar="PART", help="Part file or CAD file.")
 @click.option("-o", "--output", metavar="INSPECTION", help="File to write; default: inspection.json in OUT.")
 @click.option("--photos", metavar="FOLDER", help="Folder of the photos, if they were moved.")
@@ -86,6 +95,7 @@ def measure(
     folder: str | None,
     cloud_path: str | None,
     cloud_unit: str | None,
+    rescale: bool,
     part_path: str,
     output: str | None,
     photos: str | None,
@@ -111,8 +121,8 @@ def measure(
 
     if (folder is None) == (cloud_path is None):
         raise InputError("give either OUT, the folder of `arview reconstruct`, or --cloud FILE")
-    if cloud_unit is not None and cloud_path is None:
-        raise InputError("--cloud-unit is the unit of the file given with --cloud")
+    if cloud_path is None and (cloud_unit is not None or rescale):
+        raise InputError("--cloud-unit and --rescale are for the file given with --cloud")
     place = Path(folder) if folder is not None else Path(cloud_path or "").parent
     target = output_path(output or str(place / "inspection.json"), [part_path])
     part = load_part(part_path, unit)
@@ -126,7 +136,7 @@ def measure(
         decision=DecisionOptions(guard),
     )
     if folder is None:
-        reconstruction = read_cloud(cloud_path or "", part.model, cloud_unit)
+        reconstruction = read_cloud(cloud_path or "", part.model, cloud_unit, rescale)
     else:
         reconstruction = read_folder(folder, photos, "cloud" in methods)
     with stage_bar() as progress:

@@ -16,7 +16,9 @@ from arview.errors import InputError
 from arview.measurement.cloud.global_registration import find_model_in_cloud
 from arview.measurement.cloud.placing import cloud_in_mm, moved_to_model, orient_normals, place_cloud, scaled
 from arview.measurement.cloud.reading import UNITS_MM, possible_units, read_points, unit_of_option
+from arview.measurement.cloud.scale_check import cloud_scale
 from arview.reconstruction.colmap import read_reconstruction, sparse_model_of
+from arview.reconstruction.scale.cad import base_names
 from arview.reconstruction.scale.types import Consistency, ScaleEvidence, ScaleResult
 from arview.reconstruction.types import DenseCloud, Photo, SparseModel
 
@@ -34,6 +36,7 @@ class MetricReconstruction:
         sparse: poses and points.
         scale: the scale and what it comes from.
         cloud: the dense cloud, or None.
+        rescales: a cloud alone is divided by the factor by which it is larger than the CAD's base.
         cloud_factors: of a cloud whose unit its size leaves open, factors that are to be tried.
     """
 
@@ -41,6 +44,7 @@ class MetricReconstruction:
     scale: ScaleResult
     cloud: DenseCloud | None
     cloud_factors: tuple[float, ...] = ()
+    rescales: bool = False
 
 
 def read_folder(folder: str | Path, photos: str | Path | None = None, with_cloud: bool = True) -> MetricReconstruction:
@@ -84,13 +88,16 @@ def read_folder(folder: str | Path, photos: str | Path | None = None, with_cloud
     return MetricReconstruction(sparse, scale, cloud)
 
 
-def read_cloud(path: str | Path, model: Model | None = None, unit: str | None = None) -> MetricReconstruction:
+def read_cloud(
+    path: str | Path, model: Model | None = None, unit: str | None = None, rescales: bool = False
+) -> MetricReconstruction:  # fmt: skip
     """Read a cloud without photos, in any frame, with or without normals.
 
     Args:
         path: PLY, PCD, XYZ, PTS, CSV, LAS, LAZ or E57.
         model: the CAD, by whose size the unit is found; without it the unit is mm.
         unit: of the file, see `measurement.cloud.reading.UNITS_MM`; None: as the file declares it, or by size.
+        rescales: divide the cloud by the factor by which it is larger than the CAD's base.
 
     Raises:
         InputError: the file cannot be read, holds no points, or has the size of the CAD in no unit.
@@ -100,7 +107,7 @@ def read_cloud(path: str | Path, model: Model | None = None, unit: str | None = 
     own = _own_ply(path)
     if own is not None:
         factor = 1.0 if given is None else UNITS_MM[given]
-        return _cloud_alone(scaled(own, factor), (), ())
+        return replace(_cloud_alone(scaled(own, factor), (), ()), rescales=rescales)
     raw = read_points(path)
     known = given or raw.unit
     units = [known or "mm"]
@@ -114,7 +121,8 @@ def read_cloud(path: str | Path, model: Model | None = None, unit: str | None = 
     if len(cloud.points) < len(raw):
         warnings.append(f"the {len(raw)} points of the cloud were averaged to {len(cloud.points)}")
     factors = tuple(UNITS_MM[one] / UNITS_MM[units[0]] for one in units)
-    return _cloud_alone(cloud, tuple(warnings), factors if len(factors) > 1 else ())
+    alone = _cloud_alone(cloud, tuple(warnings), factors if len(factors) > 1 else ())
+    return replace(alone, rescales=rescales)
 
 
 def _own_ply(path: Path) -> DenseCloud | None:
@@ -167,6 +175,9 @@ def in_model_frame(reconstruction: MetricReconstruction, part: Part) -> MetricRe
         warnings.append(turned)
     evidence = scale.evidence
     std = scale.scale_std
+    if scale.scale is not None and not reconstruction.sparse.photos:
+        moved, std, note = _checked_scale(moved, part, reconstruction.rescales)
+        warnings += [note] if note else []
     if scale.scale is None:
         std = _SCALE_STD
         evidence = (ScaleEvidence("cad", found.scale, std, "the cloud's shape"),)
@@ -175,6 +186,32 @@ def in_model_frame(reconstruction: MetricReconstruction, part: Part) -> MetricRe
         evidence=evidence, warnings=tuple(warnings),
     )  # fmt: skip
     return MetricReconstruction(reconstruction.sparse.transformed(found.scale, found.model_from_scan), scale, moved)
+
+
+def _checked_scale(cloud: DenseCloud, part: Part, rescales: bool) -> tuple[DenseCloud, float | None, str]:
+    """The cloud, rescaled if asked for; the relative standard uncertainty of its scale; and what was found, in words.
+
+    A scale that contradicts the base's size has the whole difference as its uncertainty: it is not known whether the
+    scanner is wrong or the part.
+    """
+    base = tuple(base_names(part))
+    found = cloud_scale(cloud, part.model, base)
+    if found is None or not (found.is_contradiction or rescales):
+        return cloud, None, ""
+    excess = found.factor - 1.0
+    size = f"the cloud is {abs(100 * excess):.3f} % too {'large' if excess > 0 else 'small'} beside {', '.join(base)}"
+    if rescales:
+        center = part.model.bounds_in_model.mean(axis=0)
+        points = center + (cloud.points - center) / found.factor
+        return replace(cloud, points=points), found.std, f"{size}: it was divided by {found.factor:.5f}"
+    return (
+        cloud,
+        float(np.hypot(excess, found.std)),
+        (
+            f"{size} (factor {found.factor:.5f}): the scale contradicts the CAD, and U includes this; if the scanner is"
+            " wrong and not the part, measure with --rescale"
+        ),
+    )
 
 
 def _read(path: Path) -> Any:

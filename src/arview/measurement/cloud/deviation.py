@@ -53,6 +53,7 @@ class CloudDeviationOptions:
         max_std_mm: directions with a larger standard deviation are undetermined.
         missing_share: a component is missing when a smaller share of its visible surface has a point within the band.
         min_points: of a component.
+        scanned_mm: without photos, surface farther from every point of the cloud was not scanned, and is not expected.
         rival_cost: a second minimum is reported when its cost is less than this many times the best one's.
         registration: options of the solver.
     """
@@ -69,6 +70,7 @@ class CloudDeviationOptions:
     missing_share: float = 0.2
     min_points: int = 60
     rival_cost: float = 1.5
+    scanned_mm: float = 6.0
     registration: RegistrationOptions = field(
         default_factory=lambda: RegistrationOptions(min_width_mm=0.1, threshold_mm=1e-3, threshold_deg=1e-3)
     )
@@ -144,6 +146,8 @@ def measure_components_in_cloud(
         components = list(
             threads.map(lambda name: _cloud_component(name, model, part, views, o), names or part.inspected)
         )
+        if views is None:
+            components = _only_scanned(components, points, o)
         first = list(threads.map(lambda c: _measure(c, points, None, o), components))
         places = {m.component: m.measured_from_nominal for m in first if isinstance(m, Move)}
 
@@ -241,6 +245,22 @@ def _cloud_component(
         component, surface, others, tried[is_spread & seen & (to_others > joint)], tried[is_spread & touches], usable,
         spin_moves(component, surface, part), joint,
     )  # fmt: skip
+
+
+def _only_scanned(
+    components: Sequence[CloudComponent], points: CloudPoints, o: CloudDeviationOptions
+) -> list[CloudComponent]:
+    """The components with those samples that have any point of the cloud near them.
+
+    Samples of a component of which nothing was scanned are all kept: it is missing, or not covered.
+    """
+    from scipy.spatial import cKDTree
+
+    tree, out = cKDTree(points.points), []
+    for c in components:
+        near = np.isfinite(tree.query(c.samples, distance_upper_bound=o.scanned_mm)[0]) if len(c.samples) else []
+        out.append(replace(c, samples=c.samples[near]) if np.count_nonzero(near) > 0.1 * len(c.samples) else c)
+    return out
 
 
 def _around(

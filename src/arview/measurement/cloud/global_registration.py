@@ -60,8 +60,8 @@ def find_model_in_cloud(
     if scale:
         own = np.asarray(cloud.points, dtype=np.float64) * scale
         sound = np.isfinite(own).all(axis=1)
-        normals32 = np.nan_to_num(cloud.normals[sound]) if cloud.normals.any() else None
-        return Similarity(scale, find_by_pairs(own[sound], normals32, model).model_from_scan)
+        sides = np.nan_to_num(np.asarray(cloud.normals[sound], dtype=np.float64)) if cloud.normals.any() else None
+        return Similarity(scale, find_by_pairs(own[sound], sides, model).model_from_scan)
     points, normals, is_oriented = _some_points(cloud, o)
     vertices, faces, groups = model.mesh
     surface = MeshSurface(vertices, faces, groups)

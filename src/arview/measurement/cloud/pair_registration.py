@@ -9,7 +9,7 @@ speaks against a pose.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,7 @@ class PairRegistrationOptions:
     """Options of the search. Lengths are shares of the model's diameter unless named otherwise."""
 
     model_points: int = 2400  # points of the CAD whose pairs are matched
+    first_pairs: int = 7000  # the same in the first round, which finds what is the main thing in the cloud
     probes: int = 3  # cells of the table in which each pair is looked up, because noise moves it between them
     pairs: int = 24_000  # pairs of the cloud that are tried
     matches: int = 40  # pairs of the CAD that are tried for each of them, at random if there are more
@@ -47,8 +48,8 @@ class PairRegistrationOptions:
     sure_share: float = 0.35  # with as much of it found, normals are not tried the other way round
     max_inside: float = 0.25  # share of the points near the CAD that may lie inside of it
     min_lead: float = 1.06  # score over that of the next best pose, below which the place is ambiguous
-    scene: SceneOptions = SceneOptions()
-    rounds: int = 3  # searches with other pairs, until the part is found
+    scene: SceneOptions = field(default_factory=SceneOptions)  # preparation of the cloud
+    rounds: int = 4  # searches with other pairs, until the part is found
     seed: int = 0
 
 
@@ -127,8 +128,9 @@ def candidates(scene: ScenePoints, target: _Target, o: PairRegistrationOptions) 
     lists = _near_lists(scene, target.diameter_mm, o, rng)
     placements: list[Placement] = []
     signs = (1.0, -1.0) if scene.is_oriented else (1.0,)
-    for sign in signs * o.rounds:
-        pairs = _scene_pairs(scene, target, o, rng)
+    for turn, sign in enumerate(signs * o.rounds):
+        count = o.pairs if turn >= len(signs) else o.first_pairs
+        pairs = _scene_pairs(scene, target, replace(o, pairs=count), rng)
         turned = sign * scene.normals
         chosen, matches = tables.lookup(scene.points, turned, pairs, rng, target.diameter_mm)
         poses = hypotheses(

@@ -5,11 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from arview.errors import InputError
 from arview.geometry import Array
 from arview.measurement.cloud.open3d_library import load_open3d
+
+Flags = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -96,7 +99,7 @@ def scene_points(
     )  # fmt: skip
 
 
-def wide_planes(points: Array, normals: Array, diameter_mm: float, options: SceneOptions | None = None) -> Array:
+def wide_planes(points: Array, normals: Array, diameter_mm: float, options: SceneOptions | None = None) -> Flags:
     """(N,) bool, whether points are on a plane that is wider than the part, such as a table or a wall.
 
     Planes are found by Open3D's RANSAC, on few points.
@@ -152,7 +155,7 @@ def plane_weights(points: Array, normals: Array, tolerance: float, share: float 
     return weights
 
 
-def _strays(points: Array, o: SceneOptions) -> Array:
+def _strays(points: Array, o: SceneOptions) -> Flags:
     """(N,) bool, points far from their neighbours, by Open3D's statistical outlier removal."""
     o3d = load_open3d()
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
@@ -179,9 +182,9 @@ def _is_consistent(points: Array, normals: Array) -> bool:
     return len(cosine) > 0 and float(np.mean(cosine > 0)) > 0.95
 
 
-def _thin(points: Array, cell: float) -> Array:
+def _thin(points: Array, cell: float) -> NDArray[np.int64]:
     """Indices of one point for each cell of a grid."""
     index = np.floor((points - points.min(axis=0)) / cell).astype(np.int64)
     size = index.max(axis=0) + 1
     _, first = np.unique((index[:, 0] * size[1] + index[:, 1]) * size[2] + index[:, 2], return_index=True)
-    return first
+    return np.asarray(first, dtype=np.int64)
