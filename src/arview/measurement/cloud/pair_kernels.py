@@ -190,25 +190,31 @@ def refined(
             for r in range(6):
                 hessian[r, r] += 1e-4 * trace
             twist = -np.linalg.solve(hessian, gradient)
-            angle = np.sqrt(twist[0] ** 2 + twist[1] ** 2 + twist[2] ** 2)
-            if angle > 0.2:
-                twist = twist * (0.2 / angle)
-                angle = 0.2
-            s1 = np.sin(angle) / angle if angle > 1e-9 else 1.0
-            s2 = (1.0 - np.cos(angle)) / (angle * angle) if angle > 1e-9 else 0.5
-            cross = np.zeros((3, 3))
-            cross[0, 1], cross[0, 2], cross[1, 2] = -twist[2], twist[1], -twist[0]
-            cross[1, 0], cross[2, 0], cross[2, 1] = twist[2], -twist[1], twist[0]
-            turn = np.eye(3) + s1 * cross + s2 * (cross @ cross)
-            rotation, shift = np.empty((3, 3)), np.empty(3)
-            for r in range(3):
-                for c in range(3):
-                    rotation[r, c] = p[3 * r + c]
-                shift[r] = p[9 + r]
-            rotation = turn @ rotation
-            shift = turn @ shift
-            for r in range(3):
-                for c in range(3):
-                    out[k, 3 * r + c] = rotation[r, c]
-                out[k, 9 + r] = shift[r] + twist[3 + r] * size
+            _move(out[k], twist, size)
     return out
+
+
+@kernel
+def _move(pose: NDArray[np.float64], twist: NDArray[np.float64], size: float) -> None:
+    """Apply a twist, rotations first, on the left of a pose (12,); large rotations are shortened."""
+    angle = np.sqrt(twist[0] ** 2 + twist[1] ** 2 + twist[2] ** 2)
+    if angle > 0.2:
+        twist = twist * (0.2 / angle)
+        angle = 0.2
+    s1 = np.sin(angle) / angle if angle > 1e-9 else 1.0
+    s2 = (1.0 - np.cos(angle)) / (angle * angle) if angle > 1e-9 else 0.5
+    cross = np.zeros((3, 3))
+    cross[0, 1], cross[0, 2], cross[1, 2] = -twist[2], twist[1], -twist[0]
+    cross[1, 0], cross[2, 0], cross[2, 1] = twist[2], -twist[1], twist[0]
+    turn = np.eye(3) + s1 * cross + s2 * (cross @ cross)
+    rotation, shift = np.empty((3, 3)), np.empty(3)
+    for r in range(3):
+        for c in range(3):
+            rotation[r, c] = pose[3 * r + c]
+        shift[r] = pose[9 + r]
+    rotation = turn @ rotation
+    shift = turn @ shift
+    for r in range(3):
+        for c in range(3):
+            pose[3 * r + c] = rotation[r, c]
+        pose[9 + r] = shift[r] + twist[3 + r] * size

@@ -22,7 +22,7 @@ from arview.geometry import Array, apply, invert, rigid
 from arview.measurement.cloud.mesh_surface import MeshSurface
 from arview.measurement.cloud.pair_kernels import hypotheses, refined, scores
 from arview.measurement.cloud.registration import RegistrationOptions, register_to_surface
-from arview.measurement.cloud.scene_points import SceneOptions, ScenePoints, plane_weights, scene_points
+from arview.measurement.cloud.scene_points import ScenePointOptions, ScenePoints, plane_weights, scene_points
 
 
 @dataclass(frozen=True)
@@ -48,13 +48,13 @@ class PairRegistrationOptions:
     sure_share: float = 0.35  # with as much of it found, normals are not tried the other way round
     max_inside: float = 0.25  # share of the points near the CAD that may lie inside of it
     min_lead: float = 1.06  # score over that of the next best pose, below which the place is ambiguous
-    scene: SceneOptions = field(default_factory=SceneOptions)  # preparation of the cloud
+    scene: ScenePointOptions = field(default_factory=ScenePointOptions)  # preparation of the cloud
     rounds: int = 4  # searches with other pairs, until the part is found
     seed: int = 0
 
 
 @dataclass(frozen=True)
-class Placement:
+class PartPlacement:
     """A place of the CAD in a cloud.
 
     Attributes:
@@ -94,7 +94,7 @@ class _Target:
 
 def find_by_pairs(
     points: Array, normals: Array | None, model: Model, options: PairRegistrationOptions | None = None
-) -> Placement:
+) -> PartPlacement:
     """Place of the model in points (N,3) in mm, all finite, with normals (N,3) or None.
 
     Raises:
@@ -121,12 +121,12 @@ def find_by_pairs(
     return best
 
 
-def candidates(scene: ScenePoints, target: _Target, o: PairRegistrationOptions) -> list[Placement]:
+def candidates(scene: ScenePoints, target: _Target, o: PairRegistrationOptions) -> list[PartPlacement]:
     """Different places of the CAD in the cloud, the best first."""
     rng = np.random.default_rng(o.seed)
     tables = _PairTable(target, o)
     lists = _near_lists(scene, target.diameter_mm, o, rng)
-    placements: list[Placement] = []
+    placements: list[PartPlacement] = []
     signs = (1.0, -1.0) if scene.is_oriented else (1.0,)
     for turn, sign in enumerate(signs * o.rounds):
         count = o.pairs if turn >= len(signs) else o.first_pairs
@@ -340,7 +340,7 @@ def _different(
 
 def _exact(
     start: tuple[Array, float], scene: ScenePoints, target: _Target, o: PairRegistrationOptions
-) -> Placement | None:
+) -> PartPlacement | None:
     """A pose refined on the exact surface, and judged there; None if it does not converge."""
     pose, sign = start
     reach_mm = o.fine_reach * target.diameter_mm
@@ -375,4 +375,4 @@ def _exact(
     found = np.isfinite(distance)
     share = float(target.sample_weights[found] @ support[nearest[found]])
     inside = float(is_inside.sum() / max(1, is_on.sum() + is_inside.sum()))
-    return Placement(pose, share, inside, sign < 0)
+    return PartPlacement(pose, share, inside, sign < 0)

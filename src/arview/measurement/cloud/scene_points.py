@@ -16,7 +16,7 @@ Flags = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
-class SceneOptions:
+class ScenePointOptions:
     """Options of the preparation. Lengths are shares of the part's diameter unless named otherwise."""
 
     max_points: int = 400_000  # points that are looked at, at random if there are more
@@ -56,14 +56,14 @@ class ScenePoints:
 
 
 def scene_points(
-    points: Array, normals: Array | None, diameter_mm: float, options: SceneOptions | None = None
+    points: Array, normals: Array | None, diameter_mm: float, options: ScenePointOptions | None = None
 ) -> ScenePoints:
     """Prepare points (N,3) in mm, all finite, for the search of a part of a given diameter.
 
     Raises:
         InputError: too few points are left.
     """
-    o = options or SceneOptions()
+    o = options or ScenePointOptions()
     if len(points) < o.min_points:
         raise InputError(
             f"cloud: {len(points)} points are too few to find the part in it; at least {o.min_points} are needed"
@@ -99,12 +99,12 @@ def scene_points(
     )  # fmt: skip
 
 
-def wide_planes(points: Array, normals: Array, diameter_mm: float, options: SceneOptions | None = None) -> Flags:
+def wide_planes(points: Array, normals: Array, diameter_mm: float, options: ScenePointOptions | None = None) -> Flags:
     """(N,) bool, whether points are on a plane that is wider than the part, such as a table or a wall.
 
     Planes are found by Open3D's RANSAC, on few points.
     """
-    o = options or SceneOptions()
+    o = options or ScenePointOptions()
     o3d = load_open3d()
     out = np.zeros(len(points), dtype=bool)
     few = _thin(points, 2.0 * o.coarse * diameter_mm)
@@ -155,7 +155,7 @@ def plane_weights(points: Array, normals: Array, tolerance: float, share: float 
     return weights
 
 
-def _strays(points: Array, o: SceneOptions) -> Flags:
+def _strays(points: Array, o: ScenePointOptions) -> Flags:
     """(N,) bool, points far from their neighbours, by Open3D's statistical outlier removal."""
     o3d = load_open3d()
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
@@ -165,7 +165,7 @@ def _strays(points: Array, o: SceneOptions) -> Flags:
     return out
 
 
-def _normals(points: Array, o: SceneOptions) -> Array:
+def _normals(points: Array, o: ScenePointOptions) -> Array:
     """(N,3) normals of planes through neighbours, by Open3D; their sign is arbitrary."""
     o3d = load_open3d()
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
