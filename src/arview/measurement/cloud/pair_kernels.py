@@ -195,7 +195,7 @@ def refined(
 
 
 @kernel
-def _move(pose: NDArray[np.float64], twist: NDArray[np.float64], size: float) -> None:
+def _move(pose: NDArray[np.float64], twist: NDArray[np.floating], size: float) -> None:
     """Apply a twist, rotations first, on the left of a pose (12,); large rotations are shortened."""
     angle = np.sqrt(twist[0] ** 2 + twist[1] ** 2 + twist[2] ** 2)
     if angle > 0.2:
