@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from arview.cad.part import Datum
@@ -65,6 +67,9 @@ def measure_plane_by_edges(datum: Datum, views: PhotoViews, o: DatumOptions) -> 
     directions = plane_directions(normal)
     if len(fit.undetermined) and np.linalg.norm(fit.undetermined @ directions, axis=1).max() > 0.1:
         raise DatumNotMeasuredError(f"{name}: the edges in it do not determine its tilt; photograph it from more sides")
+    # Only the plane's directions count: through their correlation the others would move it.
+    held = directions @ directions.T
+    move = replace(move, twist=held @ twist, covariance=held @ covariance @ held)
     equations, _ = move_equations(datum.label, move, datum.locks)
     return DatumEquations(
         equations.label, "fit", equations.rows, equations.offsets_mm, equations.variances, equations.points,
