@@ -67,6 +67,7 @@ class StudioDocument:
                 "text": text.text,
                 "serial": part.serial,
                 "up": part.up,
+                "unit": text.value(("part", "unit")),
                 "model_hash": part.model.source_hash,
                 "diameter_mm": part.model.diameter_mm,
                 "center_mm": part.model.center_in_model.tolist(),

@@ -73,6 +73,17 @@ class PartText:
         """The file holds this text."""
         return self.text == self.saved_text
 
+    def value(self, keys: Sequence[str]) -> Any:
+        """The value at some keys as plain Python, or None where there is none.
+
+        Raises:
+            InputError: the text is not TOML.
+        """
+        found: Any = self._document().unwrap()
+        for key in keys:
+            found = found.get(key) if isinstance(found, dict) else None
+        return found
+
     def with_value(self, keys: Sequence[str], value: Plain | None) -> str:
         """The text with the value at some keys, like ("components", "post_1", "role"); None removes it.
 
