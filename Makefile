@@ -6,7 +6,7 @@ SAMPLE := samples/plate
 # A worker for each core; each test file goes to one worker, in the order of tests/conftest.py.
 PARALLEL := -n auto --dist loadgroup --no-loadscope-reorder
 
-.PHONY: help demo test test-fast check docs bench evaluate soak clean
+.PHONY: help demo test test-fast check docs guideviews bench evaluate soak clean
 
 help:
 	@echo "make demo      inspect the sample plate: report and annotated video in out/demo"
@@ -14,6 +14,7 @@ help:
 	@echo "make test-fast the quick tests of every room: a minute"
 	@echo "make check     formatting, linting, types"
 	@echo "make docs      the documentation as a site: out/docs/index.html"
+	@echo "make guideviews the small guide-view sets of the samples in guideviews/"
 	@echo "make bench     measure speed: out/bench.json"
 	@echo "make evaluate  measure accuracy on the recorded sequences: out/evaluation.json, out/evaluation.md"
 	@echo "make soak      run the live server for ten minutes, and check its memory and the age of frames"
@@ -39,6 +40,13 @@ check: $(READY)
 
 docs: $(READY)
 	NO_MKDOCS_2_WARNING=1 .venv/bin/python -m mkdocs build --quiet --strict -f tools/docs/mkdocs.yml
+
+# Small sets: 8° apart instead of 4°, and packed.
+guideviews: $(READY)
+	for part in $(patsubst samples/%/part.toml,%,$(wildcard samples/*/part.toml)); do \
+	    .venv/bin/arview guideviews samples/$$part/part.toml -o guideviews/$$part/$$part.gv --spacing 8 --packed \
+	        --preview guideviews/$$part/sheet.jpg --report guideviews/$$part/report.md || exit 1; \
+	done
 
 bench: $(READY)
 	.venv/bin/python tools/benchmarks/bench.py --json out/bench.json

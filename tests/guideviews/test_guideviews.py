@@ -10,6 +10,7 @@ import pytest
 import trimesh
 
 from arview.cad.model import Component, Model, make_model
+from arview.cad.part_file import load_part
 from arview.cad.view_range import ViewRange
 from arview.errors import InputError, MismatchError
 from arview.geometry import Array, apply, invert
@@ -441,3 +442,44 @@ def test_the_sheet_shows_the_views_and_frames_weak_ones(views: GuideViewSet) -> 
 def test_a_sheet_of_no_size_is_refused(views: GuideViewSet) -> None:
     with pytest.raises(InputError, match="contact sheet"):
         contact_sheet(assembly(), views, columns=0)
+
+
+def test_a_packed_set_is_small_and_the_same_to_a_few_micrometres(tmp_path: Path) -> None:
+    views = make_guide_views(assembly(), SPHERE, GuideViewOptions(subdivisions=1, renderer="zbuffer"))
+    views.save(tmp_path / "whole.gv")
+    views.save(tmp_path / "packed.gv", is_packed=True)
+    assert (tmp_path / "packed.gv").stat().st_size < 0.55 * (tmp_path / "whole.gv").stat().st_size
+    read = load_guide_views(tmp_path / "packed.gv", assembly())
+    for theirs, ours in zip(read, views, strict=True):
+        assert np.array_equal(theirs.cam_from_model, ours.cam_from_model)
+        assert theirs.features.edge_points == pytest.approx(ours.features.edge_points, abs=1e-4 * views.diameter_mm)
+        assert np.array_equal(theirs.features.edge_kinds, ours.features.edge_kinds)
+        assert np.array_equal(theirs.features.contour_component, ours.features.contour_component)
+
+
+@pytest.mark.parametrize("at", [0.4, 0.6, 0.9])
+def test_a_damaged_packed_set_is_refused(tmp_path: Path, at: float) -> None:
+    views = make_guide_views(assembly(), SPHERE, GuideViewOptions(subdivisions=1, renderer="zbuffer"))
+    path = tmp_path / "packed.gv"
+    views.save(path, is_packed=True)
+    content = bytearray(path.read_bytes())
+    middle = int(at * len(content))
+    content[middle : middle + 40] = b"\xff" * 40
+    path.write_bytes(content)
+    with pytest.raises(InputError, match="damaged"):
+        load_guide_views(path, assembly())
+
+
+SETS = Path(__file__).parents[2] / "guideviews"
+
+
+@pytest.mark.parametrize("name", ["bracket_plate", "manifold", "panel", "plate"])
+def test_the_sets_of_the_samples_belong_to_their_parts(name: str) -> None:
+    """Made again with `make guideviews` when a sample or the loader changes."""
+    part = load_part(SETS.parent / "samples" / name / "part.toml")
+    path = SETS / name / f"{name}.gv"
+    views = load_guide_views(path, part.model)
+    assert len(views) > 100 and views.view_range == part.effective_view_range
+    assert path.stat().st_size < 3e6
+    assert (SETS / name / "sheet.jpg").is_file()
+    assert assess(views).reason.lower() in (SETS / name / "report.md").read_text().lower()

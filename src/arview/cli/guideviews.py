@@ -10,6 +10,9 @@ from arview.cli.common import RENDERER, UNIT, main, output_path, progress_bar, s
 from arview.cli.exit_codes import ExitCode
 from arview.errors import OutputError
 
+SUBDIVISIONS = {"4": 4, "8": 3, "16": 2}
+"""Subdivisions of the icosahedron by the angle between neighbouring directions, deg."""
+
 
 @main.command(
     short_help="Render the guide views of a part into a file.",
@@ -17,16 +20,34 @@ from arview.errors import OutputError
 Examples:
   arview guideviews part.toml -o bracket.gv
   arview guideviews part.toml -o bracket.gv --preview sheet.png
+  arview guideviews part.toml -o bracket.gv --spacing 8 --packed --report bracket.md
   arview guideviews part.toml -o post.gv --component post_1""",
 )
 @click.argument("part")
 @click.option("-o", "--output", required=True, metavar="SET", help="File to write.")
 @click.option("--component", metavar="NAME", help="Render this component alone.")
-@click.option("--preview", metavar="PNG", help="Contact sheet of some of the views, with weak ones marked.")
+@click.option("--preview", metavar="PNG|JPG", help="Contact sheet of some of the views, with weak ones marked.")
+@click.option("--report", metavar="MD", help="Uniqueness report: verdict, shares, weakest views.")
+@click.option(
+    "--spacing",
+    type=click.Choice(list(SUBDIVISIONS)),
+    default="4",
+    show_default=True,
+    help="Degrees between neighbouring views; with 8 the file has a quarter of the size.",
+)
+@click.option("--packed", is_flag=True, help="Write a file of a third of the size, which takes longer to load.")
 @UNIT
 @RENDERER
 def guideviews(
-    part: str, output: str, component: str | None, preview: str | None, unit: str | None, renderer: str
+    part: str,
+    output: str,
+    component: str | None,
+    preview: str | None,
+    report: str | None,
+    spacing: str,
+    packed: bool,
+    unit: str | None,
+    renderer: str,
 ) -> None:
     """Render the guide views of PART over its declared range of viewpoints, and store them in a file.
 
@@ -35,25 +56,28 @@ def guideviews(
     from arview.cad import load_part
     from arview.guideviews import GuideViewOptions, make_guide_views
     from arview.guideviews.findings import confusable_pair
+    from arview.guideviews.report import uniqueness_report
     from arview.guideviews.uniqueness import assess
     from arview.rendering.renderers import choose_renderer
 
     loaded = load_part(part, unit)
     path = output_path(output, [loaded.path, loaded.cad_path])
     preview_path = output_path(preview, [loaded.path, loaded.cad_path, path]) if preview else None
-    if preview_path is not None and preview_path.suffix.lower() != ".png":
-        raise OutputError(f"{preview}: the name of the preview must end in .png")
+    if preview_path is not None and preview_path.suffix.lower() not in (".png", ".jpg"):
+        raise OutputError(f"{preview}: the name of the preview must end in .png or .jpg")
+    report_path = output_path(report, [loaded.path, loaded.cad_path, path, preview_path]) if report else None
     model = loaded.model.only([component]) if component else loaded.model
-    chosen = choose_renderer(renderer)
+    options = GuideViewOptions(subdivisions=SUBDIVISIONS[spacing], renderer=choose_renderer(renderer).name)
     began = time.perf_counter()
     with progress_bar("guide views") as progress:
-        views = make_guide_views(
-            model, loaded.effective_view_range, GuideViewOptions(renderer=chosen.name), progress=progress
-        )
-    views.save(path)
+        views = make_guide_views(model, loaded.effective_view_range, options, progress=progress)
+    views.save(path, packed)
     seconds = time.perf_counter() - began
     size_mb = path.stat().st_size / 1e6
-    click.echo(f"{path}: {len(views)} views of {model.name} in {seconds:.1f} s, {size_mb:.1f} MB; drawn by {chosen}")
+    click.echo(
+        f"{path}: {len(views)} views of {model.name} in {seconds:.1f} s, {size_mb:.1f} MB; "
+        f"drawn by {choose_renderer(renderer)}"
+    )
     unique = assess(views)
     click.echo(f"{unique.reason} (score {unique.score:.2f})")
     alike = confusable_pair(views, unique)
@@ -64,9 +88,13 @@ def guideviews(
 
         from arview.guideviews.sheet import contact_sheet
 
-        _, png = cv2.imencode(".png", cv2.cvtColor(contact_sheet(model, views, unique=unique), cv2.COLOR_RGB2BGR))
-        write_bytes(preview_path, png.tobytes())
+        sheet = cv2.cvtColor(contact_sheet(model, views, unique=unique), cv2.COLOR_RGB2BGR)
+        _, content = cv2.imencode(preview_path.suffix.lower(), sheet)
+        write_bytes(preview_path, content.tobytes())
         click.echo(f"wrote {preview_path}")
+    if report_path is not None:
+        write_bytes(report_path, uniqueness_report(views, unique).encode())
+        click.echo(f"wrote {report_path}")
 
 
 @main.command(

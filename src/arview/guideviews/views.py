@@ -149,8 +149,12 @@ class GuideViewSet:
         eye = -cam_from_model[:3, :3].T @ cam_from_model[:3, 3]
         return int(np.argmax(self.directions @ (eye - self.center_in_model)))
 
-    def save(self, path: str | Path) -> None:
+    def save(self, path: str | Path, is_packed: bool = False) -> None:
         """Write the set to one file, atomically.
+
+        Args:
+            path: of the file.
+            is_packed: a quarter of the size, points kept to 1/65535 of the part's size; not memory-mapped when loaded.
 
         Raises:
             OutputError: the file cannot be written.
@@ -167,7 +171,8 @@ class GuideViewSet:
             "center_in_model": self.center_in_model.tolist(),
             "diameter_mm": self.diameter_mm,
         }  # fmt: skip
-        write_arrays(Path(path), meta, {"poses": self.poses, "directions": self.directions, **self.arrays})
+        arrays = {"poses": self.poses, "directions": self.directions, **self.arrays}
+        write_arrays(Path(path), meta, arrays, is_packed)
 
 
 def load_guide_views(path: str | Path, model: Model | None = None) -> GuideViewSet:
