@@ -197,6 +197,7 @@ def test_the_command(tmp_path: Path) -> None:
     [
         ("name,x,y,z\na,0,0,0\n", None, "a length needs two"),
         ("name,x,y\na,0,0\n", None, "column 'z' is missing"),
+        (";name,x,y,z\na,0,0,0\n", None, "is missing"),
         ("name,x,y,z\na,0,0,0\na,1,0,0\n", None, "line 3: the name 'a' is not unique"),
         ("name,x,y,z\na,0,nan,0\nb,1,0,0\n", None, "line 2: y = 'nan'"),
         (None, "[[length]]\nbetween = ['a', 'a']\nmm = 5\n", "expected two different marks"),

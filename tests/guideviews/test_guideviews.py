@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -311,6 +312,39 @@ def test_a_set_comes_back_equal_and_mapped(views: GuideViewSet, saved: Path) -> 
         assert isinstance(base, np.memmap)
     assert np.array_equal(loaded.view(5).features.contour_points, views.view(5).features.contour_points)
     assert [file.name for file in saved.parent.iterdir()] == [saved.name]
+
+
+@pytest.mark.parametrize(
+    ("name", "index", "value"),
+    [
+        ("contour_start", 3, 10**9),
+        ("edge_start", -1, 0),
+        ("contour_component", 0, 7),
+        ("edge_component", 5, -1),
+        ("surface_faces", 0, 2_000_000),
+        ("surface_points", 0, np.nan),
+        ("edge_points", 4, np.inf),
+        ("surface_component", 0, 99),
+    ],
+)
+def test_indices_and_points_are_checked_when_a_set_is_read(
+    views: GuideViewSet, tmp_path: Path, name: str, index: int, value: float
+) -> None:
+    array = views.arrays[name].copy()
+    array.reshape(len(array), -1)[index] = value
+    replace(views, arrays=views.arrays | {name: array}).save(tmp_path / "a.gv")
+    with pytest.raises(InputError, match="the guide-view set is damaged"):
+        load_guide_views(tmp_path / "a.gv")
+    replace(views, arrays={key: kept for key, kept in views.arrays.items() if key != name}).save(tmp_path / "b.gv")
+    with pytest.raises(InputError, match="the guide-view set is damaged"):
+        load_guide_views(tmp_path / "b.gv")
+
+
+def test_poses_that_are_no_poses_are_refused(views: GuideViewSet, tmp_path: Path) -> None:
+    for poses in (views.poses[:-1], 2.0 * views.poses, np.full_like(views.poses, np.nan)):
+        replace(views, poses=poses).save(tmp_path / "a.gv")
+        with pytest.raises(InputError, match="the guide-view set is damaged"):
+            load_guide_views(tmp_path / "a.gv")
 
 
 def test_views_of_another_model_are_refused(saved: Path) -> None:

@@ -74,7 +74,12 @@ def test_damaged_lines_are_counted_or_refused(tmp_path: Path) -> None:
     (tmp_path / "a.xyz").write_text("\n".join(lines))
     raw = read_points(tmp_path / "a.xyz")
     assert len(raw) == 897
-    assert raw.notes == ("2 unreadable lines were left out", "1 points without finite coordinates were left out")
+    assert raw.notes == ("2 unreadable lines were left out", "1 points without sensible coordinates were left out")
+    lines[0] = "1e308 0 0"
+    (tmp_path / "c.xyz").write_text("\n".join(lines))
+    raw = read_points(tmp_path / "c.xyz")
+    assert len(raw) == 896 and "2 points without sensible coordinates were left out" in raw.notes
+    assert np.abs(raw.points + raw.origin).max() < 1e4
     lines[::7] = ["1.0 2.0"] * len(lines[::7])
     (tmp_path / "b.xyz").write_text("5 5 5\n" + "\n".join(lines))
     with pytest.raises(InputError, match=r"lines do not hold 3 numbers, as '1.0 2.0'"):

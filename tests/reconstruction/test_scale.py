@@ -200,6 +200,9 @@ def test_scale_file(tmp_path: Path) -> None:
         ("[[boards]]\n", "unknown key 'boards'"),
         ("[[tag]]\nside_mm = 3\n", "'dictionary' is missing"),
         ("[[scale_bar]]\nids = [1]\nlength_mm = 3\n", "expected the ids of two tags"),
+        ('[[tag]]\ndictionary = "4x4_50"\nside_mm = 3\nids = [inf, 2]\n', "expected the ids of tags"),
+        (f'[[tag]]\ndictionary = "4x4_50"\nside_mm = 1{"0" * 400}\n', "is not a positive length"),
+        ("[[scale_bar]]\nids = [1, nan]\nlength_mm = 3\n", "expected the ids of tags"),
         ("[rig]\n", "expected one of"),
         ("[[", "not valid TOML"),
     ):
@@ -209,9 +212,10 @@ def test_scale_file(tmp_path: Path) -> None:
     rig = tmp_path / "rig.json"
     rig.write_text(json.dumps({"cam_from_rig_mm": {"a.jpg": rigid(np.eye(3), [1, 2, 3]).tolist()}}))
     np.testing.assert_allclose(load_rig(rig).centres_mm["a.jpg"], [-1, -2, -3])
-    rig.write_text('{"centres_mm": {"a": [1, 2]}}')
-    with pytest.raises(InputError, match="a value is invalid"):
-        load_rig(rig)
+    for values in ("[1, 2]", f"[1, 2, 1{'0' * 400}]"):
+        rig.write_text(f'{{"centres_mm": {{"a": {values}}}}}')
+        with pytest.raises(InputError, match="a value is invalid"):
+            load_rig(rig)
 
 
 # --- targets and rig ------------------------------------------------------------------------------------

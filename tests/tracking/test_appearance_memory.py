@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+import zipfile
 from functools import cache
 from pathlib import Path
 
@@ -224,6 +225,22 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
         memory.load(tmp_path / "none")
     with pytest.raises(OutputError, match="cannot be written"):
         memory.save(tmp_path / "no" / "folder")
+
+
+@pytest.mark.parametrize("member", ["meta", "rotations", "pictures", "masks"])
+@pytest.mark.parametrize("header", ["(2473901161920,)", "(2,", "(1, 2)", "()"])
+def test_members_whose_headers_lie_are_refused(tmp_path: Path, member: str, header: str) -> None:
+    file = tmp_path / "views.learned"
+    six_sides().save(file)
+    with zipfile.ZipFile(file) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    text = f"{{'descr': '|u1', 'fortran_order': False, 'shape': {header}, }}\n".encode()
+    members[f"{member}.npy"] = b"\x93NUMPY\1\0" + len(text).to_bytes(2, "little") + text + bytes(64)
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in members.items():
+            archive.writestr(name, content)
+    with pytest.raises(InputError, match=r"views\.learned.*damaged.*delete the file"):
+        AppearanceMemory(assembly_views(), CAMERA).load(file)
 
 
 def test_invalid_options_are_refused() -> None:

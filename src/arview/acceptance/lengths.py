@@ -267,7 +267,7 @@ def _rows(path: Path, text: str, needed: Sequence[str]) -> list[tuple[int, Mappi
     except HeaderError:
         first = next(iter(text.splitlines()), "")
         cells = {cell.strip() for cell in re.split("[,;\t]", first)}
-        missing = next(name for name in needed if name not in cells or len(cells) == 1)
+        missing = next((name for name in needed if name not in cells or len(cells) == 1), needed[0])
         raise InputError(
             f"{path}: the column {missing!r} is missing; the first line must contain the column names"
         ) from None

@@ -97,7 +97,10 @@ def read_table(path: str | Path, is_header: Callable[[Sequence[str]], bool], exp
     lines = text.splitlines()
     for number, line in enumerate(lines[:_HEADER_LINES]):
         for delimiter in _DELIMITERS:
-            cells = [cell.strip() for cell in next(csv.reader([line], delimiter=delimiter), [])]
+            try:
+                cells = [cell.strip() for cell in next(csv.reader([line], delimiter=delimiter), [])]
+            except csv.Error as error:
+                raise InputError(f"{path}: line {number + 1}: {error}") from error
             if len(cells) > 1 and is_header(cells):
                 return _table(path, lines, number, delimiter, tuple(cells))
     raise HeaderError(f"{path}: no line names the columns {expected}, separated by ; or , or tabs")

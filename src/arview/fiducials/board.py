@@ -77,7 +77,7 @@ def dictionary_name(text: str) -> str:
 
 def parse_board(text: str) -> Board:
     """The board described on the command line, see BOARD_FORMS. Raises InputError."""
-    match = re.fullmatch(r"(charuco|grid):(\d+)x(\d+):([\d.]+):([\d.]+):([\w-]+)", text.strip(), re.IGNORECASE)
+    match = re.fullmatch(r"(charuco|grid):(\d{1,9})x(\d{1,9}):([\d.]+):([\d.]+):([\w-]+)", text.strip(), re.IGNORECASE)
     if not match:
         raise InputError(f"board {text!r}: expected {BOARD_FORMS}")
     kind, columns, rows, first, second, dictionary = match.groups()
@@ -106,7 +106,7 @@ def parse_length_mm(where: str, value: object) -> float:
 
     try:
         length = float(value)  # type: ignore[arg-type]
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         fail()
     if not 0 < length < 1e6:
         fail()

@@ -25,6 +25,7 @@ from arview.guideviews.mesh_edges import mesh_edges
 from arview.guideviews.sphere import directions_in_range, view_poses
 from arview.guideviews.store import read_arrays, write_arrays
 from arview.guideviews.surface import Surface, reduced_surface, surface_about
+from arview.guideviews.validity import check_arrays, check_poses
 from arview.rendering.renderers import open_renderer
 from arview.rendering.rendering import Rendering
 
@@ -197,14 +198,27 @@ def load_guide_views(path: str | Path, model: Model | None = None) -> GuideViewS
         )
     try:
         return _from_parts(meta, arrays)
-    except (KeyError, TypeError, ValueError, InputError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError, InputError) as error:
         raise InputError(f"{path}: the guide-view set is damaged; make it again with `arview guideviews`") from error
 
 
 def _from_parts(meta: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> GuideViewSet:
-    """A set from the metadata and the arrays of a file."""
+    """A set from the metadata and the arrays of a file, all of which are checked.
+
+    Raises:
+        InputError, KeyError, TypeError, ValueError, AttributeError, OverflowError: something is damaged.
+    """
+    names = [meta["model_name"], meta["model_hash"], *meta["component_names"]]
+    center, diameter_mm = np.array(meta["center_in_model"], dtype=np.float64), float(meta["diameter_mm"])
+    if not all(isinstance(name, str) for name in names) or center.shape != (3,) or not np.isfinite(center).all():
+        raise ValueError("names or centre")
+    if not 0.0 < diameter_mm < np.inf:
+        raise ValueError("diameter")
     width, height, fx, fy, cx, cy = meta["camera"]
     arrays = dict(arrays)
+    poses, directions = np.array(arrays.pop("poses")), np.array(arrays.pop("directions"))
+    check_poses(poses, directions)
+    check_arrays(arrays, len(poses), len(meta["component_names"]))
     ranges: dict[str, Any] = {
         name: tuple(value) if isinstance(value, list) else value for name, value in meta["view_range"].items()
     }
@@ -215,10 +229,10 @@ def _from_parts(meta: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> GuideV
         camera=Camera(width, height, fx, fy, cx, cy),
         view_range=ViewRange(**ranges),
         options=GuideViewOptions(**meta["options"]),
-        center_in_model=np.array(meta["center_in_model"]),
-        diameter_mm=meta["diameter_mm"],
-        poses=np.array(arrays.pop("poses")),
-        directions=np.array(arrays.pop("directions")),
+        center_in_model=center,
+        diameter_mm=diameter_mm,
+        poses=poses,
+        directions=directions,
         arrays=arrays,
     )
 

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import io
 import json
+import math
+import tokenize
 import zipfile
+import zlib
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,6 +21,8 @@ from arview.guideviews import GuideViewSet
 from arview.tracking.search.view_crops import CHANNELS, CROP_PX
 
 FORMAT_VERSION = 1
+MAX_BYTES = 400_000_000
+"""Bytes of the arrays of a file, unpacked; more are not read, so that a damaged file cannot fill the memory."""
 
 
 class SavedViews(NamedTuple):
@@ -72,12 +78,14 @@ def _read(path: Path) -> tuple[dict[str, Any], SavedViews]:
     """Metadata and checked arrays of a file. Raises InputError."""
     damaged = f"{path}: the learned views are damaged; delete the file to learn anew"
     try:
-        with np.load(path, allow_pickle=False) as file:
-            meta = dict(json.loads(str(file["meta"])))
-            saved = SavedViews(*(np.array(file[name]) for name in SavedViews._fields))
+        with zipfile.ZipFile(path) as archive:
+            if sum(member.file_size for member in archive.infolist()) > MAX_BYTES:
+                raise InputError(damaged)
+            meta = dict(json.loads(str(_member(archive, "meta"))))
+            saved = SavedViews(*(_member(archive, name) for name in SavedViews._fields))
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
-    except (ValueError, KeyError, EOFError, TypeError, zipfile.BadZipFile) as error:
+    except _DAMAGES as error:
         raise InputError(damaged) from error
     count = len(saved.rotations) if saved.rotations.ndim else -1
     is_valid = (
@@ -91,6 +99,25 @@ def _read(path: Path) -> tuple[dict[str, Any], SavedViews]:
     if not np.allclose(products, np.eye(3), atol=1e-6):
         raise InputError(damaged)
     return meta, saved
+
+
+_DAMAGES = (
+    ValueError, KeyError, TypeError, EOFError, OverflowError, RuntimeError, SyntaxError, zipfile.BadZipFile, zlib.error,
+    tokenize.TokenError,
+)  # fmt: skip
+"""What the readers of ZIP archives, of headers of arrays and of JSON raise for damaged files."""
+
+
+def _member(archive: zipfile.ZipFile, name: str) -> NDArray[Any]:
+    """An array of an npz archive. No memory is taken on the word of its header. Raises one of ``_DAMAGES``."""
+    data = archive.read(f"{name}.npy")
+    stream = io.BytesIO(data)
+    if np.lib.format.read_magic(stream) != (1, 0):
+        raise ValueError("version")
+    shape, is_fortran, dtype = np.lib.format.read_array_header_1_0(stream)
+    if dtype.hasobject or is_fortran:
+        raise ValueError("objects or columns first")
+    return np.frombuffer(data, dtype, math.prod(shape), stream.tell()).reshape(shape).copy()
 
 
 def _is(array: NDArray[Any], shape: tuple[int, ...], kind: type) -> bool:

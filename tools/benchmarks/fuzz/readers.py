@@ -108,7 +108,7 @@ def read_cloud(path: Path, seeds: Path) -> None:
             plain = np.loadtxt(path, ndmin=2)
         except Exception:  # damaged
             return
-        if plain.shape[1] == 3 and np.isfinite(plain).all():
+        if plain.shape[1] == 3 and (np.abs(plain) < 1e12).all():
             own = raw.points + raw.origin
             if own.shape != plain.shape or not np.allclose(
                 own, plain, rtol=1e-5, atol=1e-4 + 1e-6 * np.abs(plain).max()
@@ -131,10 +131,14 @@ def read_positions(path: Path, seeds: Path) -> None:
     """A list of a measuring machine; one with commas against Python's csv."""
     listed = read_position_list(path)
     if path.name == "deviations.csv":
-        rows = list(csv.DictReader(path.open(encoding="utf-8", newline="")))
+        try:
+            rows = list(csv.DictReader(io.StringIO(path.read_bytes().decode("utf-8"), newline="")))
+        except (UnicodeDecodeError, csv.Error):
+            return
         if all(set(row) == {"component", "dx", "dy", "dz", "Ux", "Uy", "Uz"} for row in rows):
             for own, row in zip(listed, [row for row in rows if any(row.values())], strict=True):
-                if any(float(own.displacement[axis]) != float(row[f"d{'xyz'[axis]}"] or "nan") for axis in range(3)):
+                plain = [float(row[f"d{axis}"] or "nan") for axis in "xyz"]
+                if not np.array_equal(own.displacement, plain, equal_nan=True):
                     raise differs("positions", f"{own} instead of {row}")
 
 

@@ -16,6 +16,8 @@ from arview.fiducials.board import DEFAULT_DICTIONARY, Board, Tags, dictionary_n
 from arview.geometry import Array, check_rigid
 
 BAR_FORM = "ID1:ID2:LENGTH_MM or DICTIONARY:ID1:ID2:LENGTH_MM, e.g. 3:7:500.02"
+MAX_TAG_ID = 999_999_999
+"""No dictionary has a tag of a larger id."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +63,7 @@ class ScaleSources:
 
 def parse_scale_bar(text: str, default_dictionary: str = DEFAULT_DICTIONARY) -> ScaleBar:
     """The scale bar described on the command line, see BAR_FORM. Raises InputError."""
-    match = re.fullmatch(r"(?:([A-Za-z][\w-]*|\d+x[\w-]+):)?(\d+):(\d+):([\d.]+)", text.strip())
+    match = re.fullmatch(r"(?:([A-Za-z][\w-]*|\d+x[\w-]+):)?(\d{1,9}):(\d{1,9}):([\d.]+)", text.strip())
     if not match:
         raise InputError(f"scale bar {text!r}: expected {BAR_FORM}")
     dictionary, first, second, length = match.groups()
@@ -109,17 +111,24 @@ def load_scale_file(path: str | Path) -> ScaleSources:
     for entry in _entries(content, "board", ("spec",), (), path):
         boards.append(parse_board(str(entry["spec"])))
     for entry in _entries(content, "tag", ("dictionary", "side_mm"), ("ids",), path):
-        ids = tuple(int(i) for i in entry.get("ids", ()))
+        ids = _tag_ids(f"{path}: [[tag]]", entry.get("ids", []))
         tags.append(Tags(dictionary_name(str(entry["dictionary"])), parse_length_mm(f"{path}", entry["side_mm"]), ids))
     for entry in _entries(content, "scale_bar", ("ids", "length_mm"), ("dictionary", "std_mm"), path):
-        if not isinstance(entry["ids"], list) or len(entry["ids"]) != 2:
+        ids = _tag_ids(f"{path}: [[scale_bar]]", entry["ids"])
+        if len(ids) != 2:
             raise InputError(f"{path}: [[scale_bar]] ids = {entry['ids']!r}: expected the ids of two tags")
         name = dictionary_name(str(entry.get("dictionary", DEFAULT_DICTIONARY)))
-        first, second = (int(i) for i in entry["ids"])
         std_mm = parse_length_mm(f"{path}", entry.get("std_mm", ScaleBar.std_mm))
-        bars.append(_bar(f"{path}", name, first, second, parse_length_mm(f"{path}", entry["length_mm"]), std_mm))
+        bars.append(_bar(f"{path}", name, ids[0], ids[1], parse_length_mm(f"{path}", entry["length_mm"]), std_mm))
     rig = _rig(content["rig"], f"{path}: [rig]") if "rig" in content else None
     return ScaleSources(tuple(boards), tuple(tags), tuple(bars), rig)
+
+
+def _tag_ids(where: str, value: Any) -> tuple[int, ...]:
+    """The ids of tags in a file. Raises InputError."""
+    if not isinstance(value, list) or not all(type(one) is int and 0 <= one <= MAX_TAG_ID for one in value):
+        raise InputError(f"{where} ids = {str(value)[:60]}: expected the ids of tags, whole numbers up to {MAX_TAG_ID}")
+    return tuple(value)
 
 
 def _bar(text: str, dictionary: str, first: int, second: int, length_mm: float, std_mm: float = 0.02) -> ScaleBar:
@@ -142,7 +151,7 @@ def _rig(content: Any, where: str) -> Rig:
             pose = check_rigid(matrix, f"{where}: {known[1]} of {name}")
             centres[str(name)] = -pose[:3, :3].T @ pose[:3, 3]
         distances = tuple((str(a), str(b), float(mm)) for a, b, mm in content.get(known[2], ()))
-    except (TypeError, ValueError, AttributeError) as error:
+    except (TypeError, ValueError, AttributeError, OverflowError) as error:
         raise InputError(f"{where}: a value is invalid ({error})") from error
     if not all(np.isfinite(c).all() for c in centres.values()) or not all(0 < d[2] < np.inf for d in distances):
         raise InputError(f"{where}: centres must be finite, distances positive")

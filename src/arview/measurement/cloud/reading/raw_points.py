@@ -16,6 +16,7 @@ from arview.geometry import Array
 class ReadOptions:
     """Limits of reading; they keep damaged or hostile files from filling the memory."""
 
+    max_coordinate: float = 1e12  # largest coordinate in the file's unit; others stand for points that are not there
     max_points: int = 100_000_000  # points of a file; more are refused, with advice to thin them
     max_header_bytes: int = 65_536  # length of the header of a PLY or PCD file
     max_columns: int = 64  # numbers in a line of a text file
@@ -61,7 +62,7 @@ class PointCollector:
 
     def add(self, points: NDArray[np.floating], normals: NDArray[np.floating] | None = None) -> None:
         """Add points (N,3) with their normals, if the file has any. Raises InputError above the limit."""
-        finite = np.isfinite(points).all(axis=1)
+        finite = (np.abs(points) <= self._options.max_coordinate).all(axis=1)
         if not finite.all():
             self._broken += int(np.count_nonzero(~finite))
             points = points[finite]
@@ -79,13 +80,13 @@ class PointCollector:
     def result(self, unit: str | None = None, notes: tuple[str, ...] = ()) -> RawPoints:
         """All points. Raises InputError when there is none."""
         if self._origin is None:
-            raise InputError(f"{self._path}: holds no points")
+            raise InputError(f"{self._path}: holds no points with sensible coordinates")
         normals = np.concatenate(self._normals) if self._normals else None
         points = np.concatenate(self._points)
         self._points, self._normals = [], []
         raw = RawPoints(points, normals if normals is None or len(normals) == len(points) else None, self._origin, unit)
         if self._broken:
-            notes = (*notes, f"{self._broken} points without finite coordinates were left out")
+            notes = (*notes, f"{self._broken} points without sensible coordinates were left out")
         return replace(raw, notes=notes)
 
 
