@@ -48,6 +48,7 @@ from rows import ResultRow
 from suites.detection import DetectionSuite
 from suites.guided_init import guided_init_rows
 from suites.measurement import measurement_rows
+from suites.occluders import OccluderSuite
 from suites.presence import PresenceSuite
 from suites.quality import quality_rows
 from suites.real_conditions import REAL_FRAMES, REAL_SHAPES, RealConditionsSuite
@@ -63,7 +64,7 @@ SEED = 7
 SECTIONS = (
     "track", "converge", "guided-init", "detect", "semisynthetic-track", "semisynthetic-detect", "false-alarms",
     "lookalike", "relocalize", "sample", "reconstruct", "measure", "real-track", "real-detect", "quality",
-    "accepted", "scale", "presence", "several",
+    "accepted", "scale", "presence", "several", "occluders",
 )  # fmt: skip
 
 
@@ -128,6 +129,7 @@ def main() -> None:
         lambda: [row for name in SCALED if name in every for row in scale_rows(every[name], "truth", details)],
         presence.rows,
         lambda: SeveralSuite(found, details, chosen.frames).rows(),
+        OccluderSuite(found, details).rows,
     )
     sections = dict(zip(SECTIONS, makers, strict=True))
     rows: list[ResultRow] = []

@@ -192,7 +192,10 @@ class OccluderFinder:
         core = cv2.erode((wide | ~is_part).astype(np.uint8), _SQUARE) > 0
         candidate = (wide & is_part & (core | is_strange)).astype(np.uint8)
         count, labels, stats, _ = cv2.connectedComponentsWithStats(candidate, connectivity=8)
-        sure = np.bincount(labels[known & (score > options.sure_score)], minlength=count)
+        # Near the surface's own edges and outline a small error of the pose shows the colour of what is beside.
+        expected = np.where(known[..., None], table[cells, :3] * gain, np.nan)
+        certain = known & (score > options.sure_score) & ~_is_explained(observed, expected, is_part, noise)
+        sure = np.bincount(labels[certain], minlength=count)
         area = stats[:, cv2.CC_STAT_AREA]
         kept = (area >= options.min_samples) & (sure >= options.min_sure_share * area)
         kept[0] = False
@@ -233,6 +236,22 @@ class HiddenComponents:
         self._frames = np.clip(self._frames + step, 0, _HIDDEN_FRAMES)
         self.flags |= self._frames == _HIDDEN_FRAMES
         self.flags &= self._frames > 0
+
+
+def _is_explained(
+    observed: NDArray[np.float32],
+    expected: NDArray[np.float32],
+    is_part: NDArray[np.bool_],
+    noise: NDArray[np.float32],
+) -> NDArray[np.bool_]:
+    """Samples (R,C) whose colour is between those expected of their neighbours, or that have one beside the part.
+
+    ``expected`` (R,C,3) is NaN where nothing is known; ``noise`` as of `_differences`.
+    """
+    low = cv2.erode(np.nan_to_num(expected, nan=255.0), _SQUARE) * noise[2] - noise[1]
+    high = cv2.dilate(np.nan_to_num(expected, nan=0.0), _SQUARE) * noise[3] + noise[1]
+    is_between = ((observed >= low) & (observed <= high)).all(axis=2)
+    return np.asarray(is_between | (cv2.erode(is_part.astype(np.uint8), _SQUARE) == 0))
 
 
 def _local_deviation(values: NDArray[np.float32], weight: NDArray[np.float32]) -> NDArray[np.float32]:
