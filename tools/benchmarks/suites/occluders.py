@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.camera import Camera
 from arview.cad import Part
+from arview.camera import Camera
 from arview.evaluation import Scene
 from arview.geometry import Array, apply
 from arview.overlay.ghost import Ghost, GhostView
