@@ -12,8 +12,8 @@ import numpy as np
 from arview.camera.lens import LensDistortion, LensModel
 from arview.camera.model import COLMAP_HALF_PX, Camera
 from arview.camera.undistort import require_brown
-from arview.core.atomic import replacing
-from arview.errors import InputError, OutputError
+from arview.core.atomic import write_file
+from arview.errors import InputError
 
 
 def write_camera(
@@ -39,11 +39,7 @@ def write_camera(
     if camera.lens is not None and not _holds(kind, camera.lens):
         camera = require_brown(camera, f"camera format {kind}")
     text = _arview(camera, extra) if kind == "arview" else FORMATS[kind](camera)
-    try:
-        with replacing(path) as file:
-            file.write(text.encode())
-    except OSError as error:
-        raise OutputError(f"{path}: cannot write the camera file: {error.strerror or error}") from error
+    write_file(path, text.encode())
 
 
 _LENSES: dict[str, tuple[LensModel, ...]] = {

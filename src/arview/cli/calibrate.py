@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 
 import click
 
-from arview.cli.common import Group, main, output_path, progress_bar, say, write_bytes
+from arview.cli.common import Group, main, output_path, progress_bar, say
 from arview.cli.exit_codes import ExitCode
+from arview.core.atomic import write_file
 from arview.errors import InputError, OutputError
 
 if TYPE_CHECKING:
@@ -76,7 +77,7 @@ def board(output: str, paper: str, squares: str | None, board_spec: str | None) 
         raise InputError("--board already states the number of squares; leave out --squares")
     one = parse_board(board_spec) if board_spec else fit_board(size, *_parse_squares(squares))
     sheet = place_board(one, size)
-    write_bytes(target, board_pdf(sheet))
+    write_file(target, board_pdf(sheet))
     click.echo(
         f"{one}, {sheet.width_mm:g}×{sheet.height_mm:g} mm: print it at 100 %; both rulers must measure"
         f" {sheet.ruler_mm:g} mm"
@@ -159,7 +160,7 @@ def lens(
     if picture is not None:
         from arview.calibration.plot import draw
 
-        write_bytes(picture, draw(result, picture.suffix.lower().removeprefix(".")))
+        write_file(picture, draw(result, picture.suffix.lower().removeprefix(".")))
         click.echo(f"wrote {picture}")
     not_enough = result.verdict.grade.value == "not enough"
     if not_enough and not (anyway and math.isfinite(result.verdict.focal_u)):

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 import click
 
 from arview.cli.exit_codes import ExitCode, help_rows
-from arview.core.atomic import is_device, replacing
+from arview.core.atomic import is_device
 from arview.core.progress import Progress, StepProgress
 from arview.errors import ArviewError, CannotMeasureError, InputError, OutputError, without_credentials
 from arview.version import __version__
@@ -366,15 +366,6 @@ def output_path(path: str, inputs: list[Any]) -> Path:
         if other is not None and target.resolve() == split_spec(other)[0].resolve():
             raise OutputError(f"{path}: would overwrite an input or another output; choose another name")
     return target
-
-
-def write_bytes(path: Path, content: bytes) -> None:
-    """Write a file that appears complete or not at all. Raises OutputError."""
-    try:
-        with replacing(path) as file:
-            file.write(content)
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written ({error.strerror or error})") from error
 
 
 def refuse_for_several(options: dict[str, str | None]) -> None:

@@ -15,8 +15,8 @@ from arview.cli.common import (
     progress_bar,
     say,
     session_options,
-    write_bytes,
 )
+from arview.core.atomic import write_file
 from arview.version import __version__
 
 
@@ -85,5 +85,5 @@ def evaluate(
         results.append(result.to_dict())
     if output is not None:
         content = {"version": __version__, "modalities": list(modalities), "scenes": results}
-        write_bytes(output, (json.dumps(content, indent=1) + "\n").encode())
+        write_file(output, (json.dumps(content, indent=1) + "\n").encode())
         click.echo(f"wrote {output}")

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import click
 
-from arview.cli.common import UNIT, main, output_path, say, write_bytes
+from arview.cli.common import UNIT, main, output_path, say
+from arview.core.atomic import write_file
 from arview.errors import InputError, OutputError
 
 FORMATS = ("csv", "qif", "dfq", "glb", "html", "pdf")
@@ -84,7 +85,7 @@ def export(
         made["glb"] = lambda: to_glb(loaded, model, sha256=sha256)
     for name, target in targets.items():
         if name in made:
-            write_bytes(target, made[name]())
+            write_file(target, made[name]())
     if {"html", "pdf"} & set(targets):
         from arview.report import make_report
 

@@ -6,8 +6,9 @@ import time
 
 import click
 
-from arview.cli.common import RENDERER, UNIT, main, output_path, progress_bar, say, write_bytes
+from arview.cli.common import RENDERER, UNIT, main, output_path, progress_bar, say
 from arview.cli.exit_codes import ExitCode
+from arview.core.atomic import write_file
 from arview.errors import OutputError
 
 SUBDIVISIONS = {"4": 4, "8": 3, "16": 2}
@@ -90,10 +91,10 @@ def guideviews(
 
         sheet = cv2.cvtColor(contact_sheet(model, views, unique=unique), cv2.COLOR_RGB2BGR)
         _, content = cv2.imencode(preview_path.suffix.lower(), sheet)
-        write_bytes(preview_path, content.tobytes())
+        write_file(preview_path, content.tobytes())
         click.echo(f"wrote {preview_path}")
     if report_path is not None:
-        write_bytes(report_path, uniqueness_report(views, unique).encode())
+        write_file(report_path, uniqueness_report(views, unique).encode())
         click.echo(f"wrote {report_path}")
 
 

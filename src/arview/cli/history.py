@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING
 
 import click
 
-from arview.cli.common import main, output_path, progress_bar, say, write_bytes
+from arview.cli.common import main, output_path, progress_bar, say
 from arview.cli.exit_codes import ExitCode
+from arview.core.atomic import write_file
 from arview.errors import ArviewError, InputError
 
 if TYPE_CHECKING:
@@ -171,7 +172,7 @@ def show(result: str, output: str | None, store: str | None) -> None:
     )  # fmt: skip
     if target is not None:
         text = json.dumps(json.loads(document), indent=2, ensure_ascii=False) + "\n"
-        write_bytes(target, text.encode())
+        write_file(target, text.encode())
         click.echo(f"wrote {target}")
 
 
@@ -265,7 +266,7 @@ def chart(
         if isinstance(one, Capability) and (low, high) == (series.lower, series.upper):
             ability = one
     if target is not None:
-        write_bytes(target, draw(series, limits, ability, target.suffix.lstrip(".").lower()))
+        write_file(target, draw(series, limits, ability, target.suffix.lstrip(".").lower()))
         click.echo(f"wrote {target}")
 
 
@@ -332,7 +333,7 @@ def export(
     with _open(store, must_exist=True) as opened:
         found = opened.listed(part, serial, station, since=_moment(since, zone))
         content = to_csv(opened, found) if kind == ".csv" else to_json_lines(opened, found)
-    write_bytes(target, content)
+    write_file(target, content)
     click.echo(f"wrote {target}: {len(found)} results")
 
 

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING
 
 import click
 
-from arview.cli.common import UNIT, main, output_path, say, write_bytes
+from arview.cli.common import UNIT, main, output_path, say
 from arview.cli.exit_codes import ExitCode, exit_code_of
+from arview.core.atomic import write_file
 from arview.errors import InputError
 
 if TYPE_CHECKING:
@@ -88,12 +89,12 @@ def verify(
     test = run(places, read_known(known, places), known, limit)
     _print(test, shows_all)
     if target is not None:
-        write_bytes(target, (json.dumps(record_of(test), indent=2, ensure_ascii=False) + "\n").encode())
+        write_file(target, (json.dumps(record_of(test), indent=2, ensure_ascii=False) + "\n").encode())
         click.echo(f"wrote {target}")
     if picture is not None:
         from arview.acceptance.plot import draw
 
-        write_bytes(picture, draw(test, picture.suffix.lower().removeprefix(".")))
+        write_file(picture, draw(test, picture.suffix.lower().removeprefix(".")))
         click.echo(f"wrote {picture}")
     click.get_current_context().exit(exit_code_of(test.verdict.value))
 
@@ -134,7 +135,7 @@ def _compare(measured: str, known: str, target: Path | None, model: Model | None
     agreeing = sum(bool(one.agrees) for one in found.components)
     click.echo(f"E_n ≤ 1 for {agreeing} of {len(found.components)} components")
     if target is not None:
-        write_bytes(target, (json.dumps(record_of(found), indent=2, ensure_ascii=False) + "\n").encode())
+        write_file(target, (json.dumps(record_of(found), indent=2, ensure_ascii=False) + "\n").encode())
         click.echo(f"wrote {target}")
     everything = all(one.agrees is not False for one in found.components)
     click.get_current_context().exit(ExitCode.DONE if everything else ExitCode.FAIL)

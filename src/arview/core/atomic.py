@@ -9,6 +9,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
+from arview.errors import OutputError
+
 
 @contextmanager
 def replacing(path: Path) -> Iterator[BinaryIO]:
@@ -32,6 +34,26 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
         Path(temporary).replace(path)
     finally:
         Path(temporary).unlink(missing_ok=True)
+
+
+def write_file(path: Path, content: bytes, makes_folder: bool = False) -> None:
+    """Write a file that appears complete or not at all.
+
+    Args:
+        path: of the file.
+        content: of the file.
+        makes_folder: make the folder if it is not there.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    try:
+        if makes_folder:
+            path.parent.mkdir(parents=True, exist_ok=True)
+        with replacing(path) as file:
+            file.write(content)
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written ({error.strerror or error})") from error
 
 
 def is_device(path: Path) -> bool:

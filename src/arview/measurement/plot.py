@@ -11,8 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from arview.core.atomic import replacing
-from arview.errors import OutputError
+from arview.core.atomic import write_file
 from arview.geometry import Array
 
 Picture = NDArray[np.uint8]
@@ -109,11 +108,7 @@ class Chart:
 def save_picture(image: Picture, path: Path) -> None:
     """Write a picture (H,W,3) uint8 RGB as PNG. Raises OutputError."""
     done, data = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
-    try:
-        with replacing(path) as file:
-            file.write(data.tobytes() if done else b"")
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written ({error.strerror or error})") from error
+    write_file(path, data.tobytes() if done else b"")
 
 
 def stack(pictures: Sequence[Picture]) -> Picture:

@@ -7,10 +7,10 @@ from types import NoneType
 from typing import Any
 
 from arview.cad.part import Part
-from arview.core.atomic import replacing
+from arview.core.atomic import write_file
 from arview.core.checks import PATH, check_type
 from arview.core.progress import Progress
-from arview.errors import InputError, MissingDependencyError, OutputError
+from arview.errors import InputError, MissingDependencyError
 from arview.report.evidence import ReportEvidence, gather
 from arview.report.page import ReportOptions, build_context, render
 
@@ -56,10 +56,10 @@ def make_report(
     evidence = gather(inspection, part, folder, photos)
     context = build_context(evidence, options or ReportOptions(), report_progress)
     if html is not None:
-        _write(Path(html), render(context, for_print=False).encode("utf-8"))
+        write_file(Path(html), render(context, for_print=False).encode("utf-8"))
     if pdf is not None:
         report_progress("PDF", 0, 1)
-        _write(Path(pdf), pdf_of(render(context, for_print=True), evidence))
+        write_file(Path(pdf), pdf_of(render(context, for_print=True), evidence))
     report_progress("done", 1, 1)
     return evidence
 
@@ -90,11 +90,3 @@ def _weasyprint() -> Any:
             f"the PDF needs the Pango libraries: {PANGO_INSTALL_COMMAND} (the HTML report does not)"
         ) from error
     return weasyprint
-
-
-def _write(path: Path, content: bytes) -> None:
-    try:
-        with replacing(path) as file:
-            file.write(content)
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written ({error.strerror or error})") from error

@@ -40,7 +40,7 @@ from arview.live.options import LiveOptions
 from arview.live.security.access import Access, Gate
 from arview.live.security.limits import RateLimit, body, json_body
 from arview.live.security.refusals import Refusal
-from arview.live.server.app import refusal_handlers, static_files
+from arview.live.server.app import refusal_handlers, static_files, static_response
 from arview.studio.assessment import Assessments, advice
 from arview.studio.document import StudioDocument
 from arview.studio.exports import write_exports
@@ -222,11 +222,7 @@ class StudioHandlers:
         return JSONResponse(self._document.describe())
 
     def _file(self, name: str) -> Response:
-        found = self._files.get(name)
-        if found is None:
-            raise Refusal(404, "not_found", "there is no such page")
-        content, media_type = found
-        return Response(content, media_type=media_type, headers={"Cache-Control": "no-cache"})
+        return static_response(self._files, name)
 
 
 async def _told(request: Request, error: Exception) -> Response:

@@ -10,8 +10,8 @@ from pathlib import Path
 import cv2
 
 from arview.cad.part import Part
-from arview.core.atomic import replacing
-from arview.errors import InputError, OutputError
+from arview.core.atomic import write_file
+from arview.errors import InputError
 from arview.guideviews.findings import assessed_guide_views
 from arview.guideviews.sheet import contact_sheet
 from arview.guideviews.uniqueness import assess
@@ -52,7 +52,7 @@ def write_exports(document: StudioDocument, kinds: Sequence[str]) -> list[Path]:
         else:
             ending, make = makers[kind]
             path = document.path.with_name(stem + ending)
-            _write(path, make(part))
+            write_file(path, make(part))
         written.append(path)
     return written
 
@@ -105,11 +105,3 @@ def _with_unit(value: float | None, unit: str) -> str:
 def _stem(path: Path, part: Part) -> str:
     """Beginning of the files' names: that of the part file, or of the CAD where the part file is called part.toml."""
     return part.cad_path.stem if path.stem == "part" else path.stem
-
-
-def _write(path: Path, content: bytes) -> None:
-    try:
-        with replacing(path) as file:
-            file.write(content)
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written ({error.strerror or error})") from error

@@ -10,8 +10,8 @@ import tomlkit
 from tomlkit.exceptions import TOMLKitError
 from tomlkit.items import AoT, InlineTable, Table
 
-from arview.core.atomic import replacing
-from arview.errors import InputError, OutputError
+from arview.core.atomic import write_file
+from arview.errors import InputError
 
 Plain = bool | int | float | str | Sequence[Any] | Mapping[str, Any]
 """Values that a part file holds."""
@@ -152,11 +152,7 @@ class PartText:
         Raises:
             OutputError: the file cannot be written.
         """
-        try:
-            with replacing(path) as file:
-                file.write(self.text.encode())
-        except OSError as error:
-            raise OutputError(f"{path}: cannot be written ({error.strerror or error})") from error
+        write_file(path, self.text.encode())
         self.saved_text = self.text
 
     def _step(self, taken: list[str], kept: list[str]) -> bool:

@@ -7,7 +7,7 @@ import json
 import logging
 import mimetypes
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Mapping
 from importlib import resources
 from importlib.resources.abc import Traversable
 from typing import Any
@@ -229,11 +229,7 @@ class Handlers:
         return self._hub.client(request.path_params["client"])
 
     def _file(self, name: str) -> Response:
-        found = self._files.get(name)
-        if found is None:
-            raise Refusal(404, "not_found", "there is no such page")
-        content, media_type = found
-        return Response(content, media_type=media_type, headers={"Cache-Control": "no-cache"})
+        return static_response(self._files, name)
 
     async def _answer(self, client: Client, tracked: TrackedFrame) -> Response:
         """The response to a page without WebRTC for a tracked frame."""
@@ -245,6 +241,19 @@ class Handlers:
 def refusal_handlers() -> dict[type[Exception], ErrorHandler]:
     """What answers to refusals and to bugs."""
     return {Refusal: _refused, Exception: _bug}
+
+
+def static_response(files: Mapping[str, tuple[bytes, str]], name: str) -> Response:
+    """A static file of `static_files`; browsers ask again whether it has changed.
+
+    Raises:
+        Refusal: there is no such file.
+    """
+    found = files.get(name)
+    if found is None:
+        raise Refusal(404, "not_found", "there is no such page")
+    content, media_type = found
+    return Response(content, media_type=media_type, headers={"Cache-Control": "no-cache"})
 
 
 def static_files(package: str) -> dict[str, tuple[bytes, str]]:

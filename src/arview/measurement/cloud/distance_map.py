@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arview.cad.model import Model
-from arview.core.atomic import replacing
-from arview.errors import InputError, OutputError
+from arview.core.atomic import write_file
+from arview.errors import InputError
 from arview.geometry import Array, apply, look_at
 from arview.inspection import DistanceStatistics
 from arview.measurement.cloud.mesh_surface import MeshSurface
@@ -94,11 +94,7 @@ def write_distance_ply(distances: DistanceMap, path: Path, limit_mm: float = 1.0
     for name, value in zip(_FIELDS, values, strict=True):
         rows[name] = value
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}", *_PROPERTIES, "end_header", ""]
-    try:
-        with replacing(path) as file:
-            file.write("\n".join(header).encode() + rows.tobytes())
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written ({error.strerror or error})") from error
+    write_file(path, "\n".join(header).encode() + rows.tobytes())
 
 
 def read_distance_ply(path: Path, reach_mm: float, statistics: tuple[DistanceStatistics, ...]) -> DistanceMap:

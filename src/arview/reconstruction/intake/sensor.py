@@ -11,8 +11,7 @@ import cv2
 import numpy as np
 
 from arview.camera.exif import exif_of, open_picture
-from arview.core.atomic import replacing
-from arview.errors import OutputError
+from arview.core.atomic import write_file
 from arview.reconstruction.intake.lenses import Lens
 from arview.reconstruction.intake.photos import Intake
 from arview.reconstruction.intake.reading import read_bytes, read_photo
@@ -80,12 +79,7 @@ def _turned(photo: Photo, quarter_turns: int, like: Photo, path: Path) -> Photo:
     """The photo turned clockwise, with the lens of another one."""
     pixels = np.ascontiguousarray(np.rot90(read_photo(photo.path), -quarter_turns))
     _, png = cv2.imencode(".png", cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_PNG_COMPRESSION, 1])
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with replacing(path) as file:
-            file.write(png.tobytes())
-    except OSError as error:
-        raise OutputError(f"cannot write {path}: {error.strerror or error}") from error
+    write_file(path, png.tobytes(), makes_folder=True)
     return replace(photo, path=path, width=like.width, height=like.height, lens=like.lens, camera=like.camera)
 
 

@@ -9,9 +9,8 @@ import cv2
 import numpy as np
 
 from arview.camera.undistort import FrameView, UndistortOptions
-from arview.core.atomic import replacing
+from arview.core.atomic import write_file
 from arview.core.progress import StepProgress
-from arview.errors import OutputError
 from arview.reconstruction.intake.masks import read_mask
 from arview.reconstruction.intake.photos import Intake
 from arview.reconstruction.intake.reading import read_photo
@@ -51,12 +50,7 @@ def _copied(photo: Photo, view: FrameView, path: Path, index: int) -> Photo:
         return replace(photo, camera=camera)
     picture = view.picture(read_photo(photo.path), index)
     _, png = cv2.imencode(".png", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_PNG_COMPRESSION, 1])
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with replacing(path) as file:
-            file.write(png.tobytes())
-    except OSError as error:
-        raise OutputError(f"cannot write {path}: {error.strerror or error}") from error
+    write_file(path, png.tobytes(), makes_folder=True)
     mask = None if photo.mask is None else _copied_mask(photo, view, path.with_suffix(".mask.png"))
     return replace(photo, path=path, width=camera.width, height=camera.height, camera=camera, mask=mask)
 

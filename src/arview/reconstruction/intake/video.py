@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arview.camera.exif import PhotoExif
-from arview.core.atomic import replacing
+from arview.core.atomic import write_file
 from arview.core.progress import StepProgress
-from arview.errors import InputError, OutputError
+from arview.errors import InputError
 from arview.reconstruction.intake.checks import CheckOptions, check_photo, thumbnail
 from arview.reconstruction.intake.photos import MIN_PHOTOS, Intake, ReadPhoto, assess, read_and_check
 from arview.reconstruction.intake.reading import GLANCE_PX, Pixels
@@ -213,12 +213,7 @@ def _written(frame: Frame, folder: Path, turns: int) -> ReadPhoto:
     name = f"frame_{frame.index:06d}.png"
     bgr = cv2.cvtColor(frame.image, cv2.COLOR_RGB2BGR)
     _, png = cv2.imencode(".png", bgr, [cv2.IMWRITE_PNG_COMPRESSION, 1])
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with replacing(folder / name) as file:
-            file.write(png.tobytes())
-    except OSError as error:
-        raise OutputError(f"cannot write {folder / name}: {error.strerror or error}") from error
+    write_file(folder / name, png.tobytes(), makes_folder=True)
     gray = _shrunk(cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY), GLANCE_PX)
     height, width = frame.image.shape[:2]
     exif = PhotoExif(width, height, quarter_turns_clockwise=turns)
