@@ -94,7 +94,7 @@ def test_every_help_ends_with_its_exit_codes() -> None:
 
 
 def test_the_documents_have_the_same_table() -> None:
-    text = (ROOT / "docs" / "exit-codes.md").read_text(encoding="utf-8")
+    text = (ROOT / "docs" / "reference" / "exit-codes.md").read_text(encoding="utf-8")
     for code in ExitCode:
         assert f"| {int(code)} | {code.meaning} |" in text, code
 

@@ -77,14 +77,14 @@ def test_it_serves_until_ctrl_c_and_finishes_the_recording(tmp_path: Path) -> No
         assert scheme == "http"
         page = Http(port, token)
         ends_s = time.monotonic() + 120
-        while page.json("GET", "/api/status")[1]["feed"]["width"] is None:  # until the first frame is tracked
-            assert time.monotonic() < ends_s
+        while page.json("GET", "/api/status")[1]["feed"]["width"] is None or not list(tmp_path.iterdir()):
+            assert time.monotonic() < ends_s  # until the first frame is tracked and recorded
             time.sleep(0.1)
         time.sleep(0.5)
         asked_s = time.monotonic()
         process.send_signal(signal.SIGINT)
         out, err = process.communicate(timeout=30)
-        assert time.monotonic() - asked_s < 10
+        assert time.monotonic() - asked_s < 6.0  # five, and one for a machine that does other work
     assert process.returncode == 130, err
     assert "█" not in out and "▀" not in out  # no QR code without a terminal
     assert err.splitlines()[-1] == "arview: ended; files are finished" and "Traceback" not in err

@@ -16,6 +16,8 @@ import subprocess
 import sys
 import tempfile
 import time
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +26,7 @@ HERE = Path(__file__).resolve().parent
 sys.path[:0] = [str(ROOT / "tests"), str(HERE)]
 
 SLICE_S = 20.0
+LEAST_SLICE_S = 3.0
 DEADLINE_S = 900.0
 
 
@@ -60,6 +63,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--minutes", type=float, help="how long, over all targets")
     parser.add_argument("--examples", type=int, help="inputs of each target instead of a time")
+    parser.add_argument("--parallel", type=int, default=1, help="targets at a time")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--only", nargs="*", help="targets; default: all")
     parser.add_argument("--folder", type=Path, help="where inputs of faults are kept; default: a new temporary folder")
@@ -73,26 +77,28 @@ def main() -> int:
 
     names = options.only or list(TARGETS)
     folder = options.folder or Path(tempfile.mkdtemp(prefix="arview-fuzz-"))
-    ends_s = time.monotonic() + 60.0 * (options.minutes or 1e6)
+    minutes = options.minutes or 1e6
+    ends_s = time.monotonic() + 60.0 * minutes
+    slice_s = DEADLINE_S if options.examples else min(SLICE_S, 30.0 * minutes * options.parallel / len(names))
     inputs = dict.fromkeys(names, 0)
     faults: dict[str, str] = {}
+
+    def run_one(name: str, seed: int) -> None:
+        if seed > options.seed and time.monotonic() > ends_s:  # in the first round every target is run
+            return
+        found = run_worker(name, seed, options.examples, max(LEAST_SLICE_S, slice_s), folder)
+        inputs[name] += found["inputs"]
+        for signature, text in found["faults"]:
+            if signature not in faults:
+                faults[signature] = text
+                print(f"fault: {signature}: {text}", flush=True)
+
     seed = options.seed
-    while time.monotonic() < ends_s:
-        for name in names:
-            left_s = ends_s - time.monotonic()
-            if left_s <= 0:
-                break
-            slice_s = DEADLINE_S if options.examples else min(SLICE_S, left_s)
-            found = run_worker(name, seed, options.examples, slice_s, folder)
-            inputs[name] += found["inputs"]
-            for signature, text in found["faults"]:
-                if signature not in faults:
-                    faults[signature] = text
-                    print(f"fault: {signature}: {text}", flush=True)
-        if options.examples:
-            break
-        seed += 1
-        print(f"{sum(inputs.values())} inputs, {len(faults)} faults", flush=True)
+    with ThreadPoolExecutor(options.parallel) as pool:
+        while seed == options.seed or (time.monotonic() < ends_s and not options.examples):
+            list(pool.map(partial(run_one, seed=seed), names))
+            seed += 1
+            print(f"{sum(inputs.values())} inputs, {len(faults)} faults", flush=True)
     print(f"{len(names)} targets: " + ", ".join(f"{name} {count}" for name, count in inputs.items()))
     print(f"{sum(inputs.values())} inputs, {len(faults)} faults" + (f"; inputs in {folder}" if faults else ""))
     return 1 if faults or not all(inputs.values()) else 0

@@ -16,7 +16,7 @@ from seeds import make_seeds
 
 from arview.cli import main
 
-LEFT_OUT = {"live", "warmup", "batch"}
+LEFT_OUT = {"live", "studio", "warmup", "batch"}
 """Commands that run for long or start other processes: their options are tested by name in tests/live and tests/cli."""
 TEXTS = (
     "",
@@ -70,12 +70,8 @@ def commands(group: click.Group, prefix: tuple[str, ...] = ()) -> list[tuple[tup
 def fuzz_command_line(folder: Path) -> tuple[Callable[[Any], None], st.SearchStrategy[Any]]:
     """The attempt on a command line and the strategy of its argument."""
     home = folder / "commands" / "seeds"
-    seeds = make_seeds(home)
-    files = [
-        path
-        for kind in ("part", "inspection", "camera", "positions", "guideviews", "picture", "cloud", "scale")
-        for path in seeds[kind][:1]
-    ]
+    kinds = ("part", "inspection", "camera", "positions", "guideviews", "picture", "cloud", "scale")
+    files = [paths[0] for paths in make_seeds(home, *kinds).values()]
     known = commands(main)
     work = folder / "commands" / "work"
     work.mkdir(parents=True, exist_ok=True)
@@ -105,8 +101,8 @@ def fuzz_command_line(folder: Path) -> tuple[Callable[[Any], None], st.SearchStr
         number, options, arguments = argument
         names, command = known[number % len(known)]
         words = list(names)
-        for place, (index, content) in enumerate(options):
-            choices = [one for one in command.params if isinstance(one, click.Option)]
+        choices = [one for one in command.params if isinstance(one, click.Option)]
+        for place, (index, content) in enumerate(options if choices else []):
             option = choices[index % len(choices)]
             words.append(option.opts[index % len(option.opts)])
             if not (option.is_flag or option.count):

@@ -6,25 +6,33 @@ import csv
 import io
 import json
 from collections.abc import Callable
+from contextlib import suppress
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from guard import Fault
+from lxml import etree
 
 from arview.acceptance.lengths import read_known, read_measured
 from arview.acceptance.position_list import read_position_list
 from arview.cad import load_part
+from arview.cad.formats.step_text import prepare_step, products_without_shape, step_unit_mm
 from arview.cad.load import load_cad
 from arview.camera.read import load_camera
+from arview.errors import InputError
 from arview.guideviews import load_guide_views
 from arview.inspection import load_inspection
+from arview.inspection.export import to_csv, to_dfq, to_qif
 from arview.measurement.cloud.reading.files import read_points
+from arview.reconstruction.given_poses import read_poses
 from arview.reconstruction.intake.reading import glance, read_photo
 from arview.reconstruction.scale.specs import load_rig, load_scale_file
 from arview.tracking.appearance_file import load_views
 from arview.video import open_source
 from arview.workflow.jobs_file import load_jobs
+from helpers.paths import SHARED, TESTS
 
 MAX_FRAMES = 40
 
@@ -156,6 +164,48 @@ def read_lengths(path: Path, seeds: Path) -> None:
         read_known(path, read_measured(seeds / "marks.csv"))
 
 
+def read_step_text(path: Path, seeds: Path) -> None:
+    """What is read of a STEP file without OpenCASCADE: encoding, instances, solids, unit, products without shape."""
+    data = path.read_bytes()
+    prepared = prepare_step(data, path)
+    products_without_shape(prepared)
+    with suppress(InputError):
+        step_unit_mm(prepared, path)
+
+
+def read_given(path: Path, seeds: Path) -> None:
+    """Poses of photos by nerfstudio, Metashape and COLMAP; they must be rigid."""
+    if path.suffix == ".txt":
+        folder = path.parent / "colmap"
+        folder.mkdir(exist_ok=True)
+        (folder / "cameras.txt").write_text("1 OPENCV 640 480 600 601 320 240 0.1 -0.05 0.001 0.0\n")
+        (folder / "points3D.txt").write_text("")
+        (folder / "images.txt").write_bytes(path.read_bytes())
+        path = folder
+    for one in read_poses(path):
+        pose = one.cam_from_scan
+        if not np.isfinite(pose).all() or not np.allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-6):
+            raise Fault("given pose is not rigid", f"{one}")
+
+
+def read_and_export(path: Path, seeds: Path) -> None:
+    """QIF, DFQ and CSV of an inspection that was accepted: QIF by its schema, CSV against the inspection."""
+    inspection = load_inspection(path)
+    document = etree.fromstring(to_qif(inspection))
+    if not _qif_schema().validate(document):
+        raise Fault("QIF is not valid", str(_qif_schema().error_log)[:300])
+    to_dfq(inspection)
+    rows = list(csv.DictReader(io.StringIO(to_csv(inspection), newline="")))
+    if len(rows) != len(inspection.components):
+        raise differs("csv", f"{len(rows)} rows of {len(inspection.components)} components")
+
+
+@cache
+def _qif_schema() -> Any:
+    published = SHARED / "qif3" / "QIFApplications" / "QIFDocument.xsd"
+    return etree.XMLSchema(etree.parse(published if published.is_file() else TESTS / "inspection" / "qif3_subset.xsd"))
+
+
 def read_learned(path: Path, seeds: Path) -> None:
     """Learned views, of the seed's guide views."""
     load_views(path, load_guide_views(seeds / "brick.guideviews.npz"))
@@ -169,11 +219,14 @@ def read_guide_views(path: Path, seeds: Path) -> None:
 
 READERS: dict[str, Callable[[Path, Path], Any]] = {
     "cad": read_cad,
+    "step": lambda path, _: load_cad(path),
+    "step_text": read_step_text,
     "camera": read_camera,
     "picture": read_picture,
     "video": read_video,
     "cloud": read_cloud,
     "inspection": read_inspection,
+    "exports": read_and_export,
     "positions": read_positions,
     "part": read_part,
     "lengths": read_lengths,
@@ -181,5 +234,6 @@ READERS: dict[str, Callable[[Path, Path], Any]] = {
     "guideviews": read_guide_views,
     "scale": lambda path, _: load_scale_file(path),
     "rig": lambda path, _: load_rig(path),
+    "given": read_given,
     "jobs": lambda path, _: load_jobs(path),
 }

@@ -131,10 +131,18 @@ async def ask(app: Any, method: str, target: str, headers: list[tuple[str, str]]
     return int(sent[0]["status"]), content
 
 
+def check_answer(name: str, method: str, target: str, status: int, content: bytes) -> None:
+    """Raise Fault unless an answer is one that the server may give: no failure, errors as JSON."""
+    if status == 500 or not 200 <= status < 600:
+        raise Fault(f"{name} {status}", f"{method} {target} {content[:200]!r}")
+    if status >= 400 and method != "HEAD" and status != 403:
+        json.loads(content)
+
+
 def fuzz_requests(folder: Path) -> tuple[Callable[[Any], None], st.SearchStrategy[Any]]:
     """The attempt on the application and the strategy of its argument."""
     home = folder / "http" / "seeds"
-    seeds = make_seeds(home)
+    seeds = make_seeds(home, "part", "picture")
     jpeg = next(path for path in seeds["picture"] if path.suffix == ".jpg").read_bytes()
     bodies = (*BODIES, jpeg)
     options = LiveOptions(
@@ -186,9 +194,6 @@ def fuzz_requests(folder: Path) -> tuple[Callable[[Any], None], st.SearchStrateg
             return
         with guarded("http", folder / "http" / "native.txt"):
             status, content = loop.run_until_complete(one())
-            if status == 500 or not 200 <= status < 600:
-                raise Fault(f"http {status}", f"{method} {target} {content[:200]!r}")
-            if status >= 400 and method != "HEAD" and status != 403:
-                json.loads(content)
+            check_answer("http", method, target, status, content)
 
     return attempt, REQUESTS

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
 import numpy as np
 
 from arview.cad import load_part
-from arview.guideviews import GuideViewOptions, make_guide_views
+from arview.guideviews import GuideViewOptions, load_guide_views, make_guide_views
 from arview.tracking.appearance_file import SavedViews, save_views
 from arview.tracking.search.view_crops import CHANNELS, CROP_PX
-from helpers.cad_files import box, nested_3mf, nested_glb, obj_text
+from helpers.cad_files import StepBodies, StepWriter, box, nested_3mf, nested_glb, nested_step, obj_text
 from helpers.video_files import numbered, write_clip
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -111,6 +112,16 @@ JOBS = (
     'photos = "b"\n'
 )
 LENGTHS = 'name = "bar"\ncertificate = "C-1"\n[[length]]\nbetween = ["post_1", "post_2"]\nmm = 30.5\nU_mm = 0.004\n'
+METASHAPE = """<?xml version="1.0" encoding="UTF-8"?>
+<document version="1.2.0"><chunk><sensors next_id="1"><sensor id="0" label="cam" type="frame">
+<resolution width="640" height="480"/><calibration type="frame" class="adjusted">
+<resolution width="640" height="480"/><f>600.5</f><cx>1.5</cx><cy>-2.5</cy><k1>0.1</k1><k2>-0.05</k2></calibration>
+</sensor></sensors><cameras>
+<camera id="0" sensor_id="0" label="a"><transform>1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1</transform></camera>
+<camera id="1" sensor_id="0" label="b"><transform>1 0 0 5 0 1 0 0 0 0 1 0 0 0 0 1</transform></camera>
+</cameras></chunk></document>
+"""
+IMAGES = "# Image list\n1 1 0 0 0 0.5 0.25 2.5 1 a.jpg\n\n2 0.8 0.6 0 0 0.5 0.25 2.5 1 b.jpg\n\n"
 MARKS = "name,x,y,z\npost_1,0,0,0\npost_2,30.5,0,0\n"
 
 
@@ -183,27 +194,67 @@ def _texts(folder: Path, files: dict[str, str]) -> list[Path]:
     return [folder / name for name in files]
 
 
-def make_seeds(folder: Path) -> dict[str, list[Path]]:
-    """Write the files; returns their paths by kind."""
-    folder.mkdir(parents=True, exist_ok=True)
-    seeds = {"cad": _cad(folder), "camera": _texts(folder, CAMERAS), "picture": _pictures(folder)}
-    seeds |= {"video": _videos(folder), "cloud": _clouds(folder), "positions": _texts(folder, TABLES)}
-    seeds["part"] = [*_texts(folder, {"part.toml": PART}), SAMPLE / "part.toml"]
-    seeds["scale"], seeds["rig"] = _texts(folder, {"scale.toml": SCALE}), _texts(folder, {"rig.json": RIG})
-    seeds["jobs"] = _texts(folder, {"jobs.toml": JOBS})
-    seeds["lengths"] = _texts(folder, {"lengths.toml": LENGTHS, "marks.csv": MARKS})
-    seeds["inspection"] = [SAMPLE / "inspection.json"]
-    part = load_part(folder / "part.toml")
-    views = make_guide_views(
-        part.model, part.effective_view_range, GuideViewOptions(subdivisions=0, resolution_px=100, renderer="zbuffer")
+def _part(folder: Path) -> list[Path]:
+    _cad(folder)
+    return [*_texts(folder, {"part.toml": PART}), SAMPLE / "part.toml"]
+
+
+def _step(folder: Path) -> list[Path]:
+    bodies = StepBodies(
+        "two", [("a", (1.0, 1.0, 1.0), (0.0, 0.0, 0.0), None), ("b", (1.0, 1.0, 1.0), (3.0, 0, 0), None)]
     )
-    views.save(folder / "brick.guideviews.npz")
-    seeds["guideviews"] = [folder / "brick.guideviews.npz"]
+    return [nested_step(folder, "mm"), nested_step(folder, "inch"), StepWriter().write(folder / "bodies.step", bodies)]
+
+
+def _given(folder: Path) -> list[Path]:
+    poses = folder / "poses.json"
+    frames = [{"file_path": f"{name}.jpg", "transform_matrix": np.eye(4).tolist()} for name in "abc"]
+    poses.write_text(json.dumps({**json.loads(CAMERAS["transforms.json"]), "frames": frames}))
+    return [poses, *_texts(folder, {"metashape.xml": METASHAPE, "images.txt": IMAGES})]
+
+
+def _guide_views(folder: Path) -> list[Path]:
+    _part(folder)
+    part = load_part(folder / "part.toml")
+    options = GuideViewOptions(subdivisions=0, resolution_px=100, renderer="zbuffer")
+    make_guide_views(part.model, part.effective_view_range, options).save(folder / "brick.guideviews.npz")
+    return [folder / "brick.guideviews.npz"]
+
+
+def _learned(folder: Path) -> list[Path]:
+    views = load_guide_views(_guide_views(folder)[0])
     saved = SavedViews(
         np.stack([np.eye(3)] * 2),
         np.zeros((2, CROP_PX, CROP_PX, CHANNELS), np.uint8),
         np.zeros((2, CROP_PX, CROP_PX), np.uint8),
     )
     save_views(folder / "brick.learned.npz", saved, views)
-    seeds["learned"] = [folder / "brick.learned.npz"]
-    return seeds
+    return [folder / "brick.learned.npz"]
+
+
+_MAKERS: dict[str, Callable[[Path], list[Path]]] = {
+    "cad": _cad,
+    "step": _step,
+    "step_text": _step,
+    "camera": lambda folder: _texts(folder, CAMERAS),
+    "picture": _pictures,
+    "video": _videos,
+    "cloud": _clouds,
+    "positions": lambda folder: _texts(folder, TABLES),
+    "part": _part,
+    "scale": lambda folder: _texts(folder, {"scale.toml": SCALE}),
+    "rig": lambda folder: _texts(folder, {"rig.json": RIG}),
+    "given": _given,
+    "jobs": lambda folder: _texts(folder, {"jobs.toml": JOBS}),
+    "lengths": lambda folder: _texts(folder, {"lengths.toml": LENGTHS, "marks.csv": MARKS}),
+    "inspection": lambda folder: [SAMPLE / "inspection.json"],
+    "exports": lambda folder: [SAMPLE / "inspection.json"],
+    "guideviews": _guide_views,
+    "learned": _learned,
+}
+
+
+def make_seeds(folder: Path, *kinds: str) -> dict[str, list[Path]]:
+    """Write the files of some kinds; returns their paths by kind."""
+    folder.mkdir(parents=True, exist_ok=True)
+    return {kind: _MAKERS[kind](folder) for kind in kinds}

@@ -18,7 +18,9 @@ from hypothesis import strategies as st
 from mutations import CHANGES, changed
 from readers import READERS
 from requests_to_app import fuzz_requests
+from requests_to_studio import fuzz_studio
 from seeds import make_seeds
+from written_poses import fuzz_poses
 
 ROUND = 200
 
@@ -26,7 +28,7 @@ ROUND = 200
 def fuzz_reader(name: str, folder: Path) -> tuple[Callable[[Any], None], st.SearchStrategy[Any]]:
     """The attempt on a reader and the strategy of its argument."""
     home = folder / name / "seeds"
-    read, paths = READERS[name], make_seeds(home)[name]
+    read, paths = READERS[name], make_seeds(home, name)[name]
     for path in paths:
         read(path, home)  # valid files are read, and inner loops compiled, before anything is measured
     log = folder / name / "native.txt"
@@ -44,8 +46,15 @@ def fuzz_reader(name: str, folder: Path) -> tuple[Callable[[Any], None], st.Sear
     return attempt, st.tuples(st.integers(0, 100), CHANGES, st.booleans())
 
 
-SURFACES = {"http": fuzz_requests, "commands": fuzz_command_line}
+SURFACES = {
+    "http": fuzz_requests,
+    "studio": fuzz_studio,
+    "commands": fuzz_command_line,
+    "poses": fuzz_poses,
+}
 TARGETS = (*READERS, *SURFACES)
+COSTLY = {"step": 8, "studio": 2, "commands": 2, "exports": 2}
+"""Targets of which only one of so many inputs is tried where a number of inputs is given."""
 
 
 def fuzz(name: str, number: int, examples: int | None, seconds: float, folder: Path) -> dict[str, Any]:
@@ -54,6 +63,7 @@ def fuzz(name: str, number: int, examples: int | None, seconds: float, folder: P
     logging.disable(logging.CRITICAL)
     (folder / name).mkdir(parents=True, exist_ok=True)
     attempt, strategy = SURFACES[name](folder) if name in SURFACES else fuzz_reader(name, folder)
+    examples = None if examples is None else max(1, examples // COSTLY.get(name, 1))
     ends_s, inputs, rounds = time.monotonic() + seconds, 0, 0
     faults: dict[str, str] = {}
     while time.monotonic() < ends_s and (examples is None or inputs < examples):
