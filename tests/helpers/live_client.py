@@ -86,7 +86,7 @@ class Http:
     """Requests of a page over one connection."""
 
     def __init__(self, port: int, token: str, headers: dict[str, str] | None = None) -> None:
-        self._connection = http.client.HTTPConnection(LOOPBACK, port, timeout=30)
+        self._connection = http.client.HTTPConnection(LOOPBACK, port, timeout=120)
         origin = f"http://{LOOPBACK}:{port}"
         self.headers = {"Cookie": f"arview_{port}={token}", "Origin": origin, **(headers or {})}
 

@@ -52,7 +52,8 @@ def options(**more: Any) -> LiveOptions:
             per_s=1e6, burst=1e6, strangers_per_s=1e6, strangers_burst=1e6, joins_per_s=1e6, joins_burst=1e6
         ),
         "connections": ConnectionLimits(handshakes_per_s=1e6, handshakes_burst=1e6),
-        "jpeg_silence_s": 120.0, "webrtc": WebrtcOptions(connect_timeout_s=60.0),  # tests share their cores
+        "jpeg_silence_s": 120.0, "tracking_timeout_s": 60.0,  # tests share their cores
+        "webrtc": WebrtcOptions(connect_timeout_s=60.0),
     }  # fmt: skip
     if "inspection" in more:
         more["inspections"] = () if (path := more.pop("inspection")) is None else (path,)
