@@ -22,8 +22,10 @@ from arview.measurement.datums.equations import (
     surface_equations,
 )
 from arview.measurement.datums.in_photos import measure_datums_in_photos
+from arview.measurement.photo import measure_components_in_photos
 from arview.measurement.photo.views import views_of
 from arview.measurement.types import Move
+from helpers import photo_scene
 from helpers.photo_scene import CAMERA, photograph, ring
 from helpers.plate_scene import HOLE_MM, plate_with_holes
 
@@ -196,3 +198,28 @@ def test_hole_in_thin_sheet() -> None:
     root = np.sqrt(weights / found.variances)[:, None]
     solution = np.linalg.lstsq(design * root, found.offsets_mm * root[:, 0], rcond=None)[0]
     assert np.abs(solution[:2] - shift[:2]).max() < 0.06, solution  # a pixel is 0.72 mm
+
+
+@pytest.mark.slow
+def test_plane_of_thin_sheet_without_texture(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Beside every edge of the plane the sheet's other one runs: the fit of the whole sheet carries the plane."""
+    vertices, faces = plate_with_holes()
+    thin = vertices * np.array([1.0, 1.0, 0.2])
+    nominal = make_model("sheet", (Component("sheet", thin, faces),))
+    shift = np.array([0.2, -0.1, 0.4])
+    built = make_model("sheet", (Component("sheet", thin + shift, faces),))
+    monkeypatch.setattr(photo_scene, "_texture", lambda points, seed: np.full(len(points), 120.0))
+    poses = ring(12)
+    grays = [cv2.cvtColor(photograph(built, pose, seed=3), cv2.COLOR_RGB2GRAY) for pose in poses]
+    views = views_of(grays, (CAMERA,) * 12, np.stack(poses), nominal, tuple(f"img_{index}" for index in range(12)))
+    whole = measure_components_in_photos(views, None, nominal)["sheet"]["edges"]
+    assert isinstance(whole, Move), whole
+    plane = Datum("A", "plane", "sheet", (0.0, 50.0, 0.0), (0.0, 0.0, 1.0))
+    found = measure_datums_in_photos((plane,), views, {"sheet": whole})[0]
+    assert found.directions is not None and found.feature == "fit"
+    rows = found.rows[:, [0, 1, 5]]
+    solution = np.linalg.lstsq(rows, found.offsets_mm, rcond=None)[0]
+    spread = np.sqrt(np.diag(np.linalg.inv(rows.T @ (rows / found.variances[:, None]))))
+    assert abs(solution[2] - shift[2]) < min(0.08, 4.0 * spread[2]), (solution, spread)  # a pixel is 0.72 mm
+    assert np.abs(solution[:2]).max() * 100.0 < 0.1, solution
+    assert spread[2] < 0.08

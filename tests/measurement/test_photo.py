@@ -16,6 +16,7 @@ from arview.measurement.photo import PhotoViews, fit_rim, measure_components_in_
 from arview.measurement.photo.views import views_of
 from arview.measurement.types import Method, Move, NotMeasured
 from helpers import photo_scene
+from helpers.cad_files import box
 from helpers.photo_scene import CAMERA, bench, photograph, ring
 from helpers.synthetic import post
 
@@ -162,6 +163,28 @@ def test_missing_without_texture() -> None:
         elsewhere = painted()["block_4"][method]
         assert isinstance(elsewhere, NotMeasured) and not elsewhere.is_missing
     assert all(isinstance(painted(is_there=False)[name]["edges"], Move) for name in BLOCKS[:3])
+
+
+def test_thin_sheet_whose_narrow_face_is_not_seen() -> None:
+    """A sheet of 2 mm stands on edge, its top as bright as the ground: of two edges 1 to 3 px apart one is seen."""
+    vertices, faces = box((-60, 2, 0), (-20, 4, 40))
+    plain = make_model("bench", (NOMINAL.component("bench"), NOMINAL.component("plate")))
+    nominal = make_model("bench", (*plain.components, Component("sheet", vertices, faces.astype(np.int32))))
+    place = place_of(nominal, "sheet", (0.4, -0.3, 0.2), (0.0, 0.0, 0.0))
+
+    def paint(points: Array, seed: int) -> Array:
+        return np.where(points[:, 2] > 0.01, 70.0 * 1.25 / 0.8, np.where(points[:, 2] > -7.9, 70.0, 30.0))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(photo_scene, "_texture", paint)
+        views = views_on(nominal, displaced(nominal, {"sheet": place}), 12)
+    move = measure_components_in_photos(views, None, nominal, names=["sheet"])["sheet"]["edges"]
+    assert isinstance(move, Move), move
+    shift, turn_deg = errors(move, place)
+    assert np.linalg.norm(shift) < 0.1, shift  # a pixel is 0.72 mm
+    assert (np.abs(shift) < 4.0 * np.sqrt(np.diag(move.covariance)[3:])).all(), shift
+    assert np.abs(turn_deg).max() < 0.4, turn_deg
+    assert len(move.undetermined) == 0
 
 
 def test_samples_of_a_plane_say_where_it_is() -> None:

@@ -25,8 +25,9 @@ from arview.measurement.datums.options import DatumOptions
 from arview.measurement.datums.plane_edges import measure_plane_by_edges
 from arview.measurement.datums.planes import inside_triangles, plane_neighbours, plane_samples
 from arview.measurement.datums.rims import Rim, find_rim
-from arview.measurement.photo.edges import EdgePoints, edge_offsets
+from arview.measurement.photo.edges import edge_offsets
 from arview.measurement.photo.patches import near_edges, near_others, tangents_of
+from arview.measurement.photo.rival_edges import EdgePoints
 from arview.measurement.photo.sweep import sweep_offsets
 from arview.measurement.photo.views import PhotoViews
 from arview.measurement.types import Move
@@ -74,7 +75,7 @@ def _measure(datum: Datum, views: PhotoViews, moves: Mapping[str, Move], o: Datu
         if datum.feature != "plane":
             raise
         try:
-            return measure_plane_by_edges(datum, views, o)
+            return measure_plane_by_edges(datum, views, o, moves.get(datum.component))
         except DatumNotMeasuredError as by_edges:
             reason = str(by_edges).removeprefix(f"datum {datum.label} ({datum.feature}): ")
             raise DatumNotMeasuredError(f"{error}; nor by its edges: {reason}") from by_edges

@@ -20,6 +20,7 @@ class DatumOptions:
     rim_points: int = 120  # around a hole; about one px apart on small ones
     fine_reach_px: float = 3.0  # search range around the place that the first search of a rim found
     rim_px: float = 0.07  # standard uncertainty of a rim's position by rust, chalk and burrs beside it
+    plane_form_mm: float = 0.02  # standard uncertainty of a plane beside all other edges of its component, by form
     rival_px: float = 3.0  # rim points with the opposite rim this near in a photo are not used there
     sweep: SweepOptions = field(default_factory=SweepOptions)
     alignment: AlignmentOptions = field(default_factory=AlignmentOptions)

@@ -11,36 +11,101 @@ from arview.geometry import Array, exp_so3, log_so3, rigid
 from arview.measurement.datums.equations import DatumEquations, DatumNotMeasuredError, move_equations
 from arview.measurement.datums.options import DatumOptions
 from arview.measurement.photo.component import MeasuredComponent
-from arview.measurement.photo.edges import ComponentEdges, EdgePoints, edge_offsets
+from arview.measurement.photo.edges import ComponentEdges, edge_offsets
 from arview.measurement.photo.fit import RigidFit, fit_rigid, move_rows
 from arview.measurement.photo.options import PhotoOptions
 from arview.measurement.photo.patches import tangents_of
-from arview.measurement.photo.rival_edges import rival_px
+from arview.measurement.photo.rival_edges import EdgePoints, rival_px
 from arview.measurement.photo.views import PhotoViews
 from arview.measurement.types import Move
 
 
-def measure_plane_by_edges(datum: Datum, views: PhotoViews, o: DatumOptions) -> DatumEquations:
+def measure_plane_by_edges(
+    datum: Datum, views: PhotoViews, o: DatumOptions, whole: Move | None = None
+) -> DatumEquations:  # fmt: skip
     """Equations of a datum plane from steps of brightness across all edges of the component that lie in it.
 
     Shift and turn of these edges are fitted in space from all photos at once; only the two rotations and the
-    displacement along the normal, which a plane locks, are used. Edges beside which another one runs are left out.
+    displacement along the normal, which a plane locks, are used. Edges beside which another one runs are left out: in
+    thin sheet they may be few. The fit of the whole component tells where its plane is too, but for its form, and is
+    combined with them by covariance.
+
+    Args:
+        datum: the plane.
+        views: the photos.
+        o: see `DatumOptions`.
+        whole: measured move of the datum's component, or None.
 
     Raises:
         DatumNotMeasuredError: too few of its edges are seen, or they do not determine the plane.
     """
-    name = f"datum {datum.label} ({datum.feature})"
     index = views.model.index(datum.component)
     body = MeasuredComponent(views, index, None, PhotoOptions(edges=o.edges))
     predicted = ComponentEdges(body).predicted(np.eye(4))
     normal, point = np.array(datum.direction_in_model), np.array(datum.point_in_model)
     lies = np.abs((predicted.points - point) @ normal) < 0.05
     lies &= np.abs(predicted.tangents @ normal) < 0.02
-    edges = predicted.of(lies & (rival_px(predicted, views, o.rival_px) > o.rival_px))
+    edges, is_clear = predicted.of(lies), rival_px(predicted, views, o.rival_px)[lies] > o.rival_px
+    directions = plane_directions(normal)
+    _check_seen(datum, edges, o)
+    moves = []
+    if whole is not None and not _is_open(whole, directions):
+        form = np.diag(np.repeat([whole.radius_mm, 1.0], 3) ** -2.0) * o.plane_form_mm**2
+        moves = [replace(whole, covariance=whole.covariance + form).at(edges.points.mean(axis=0))]
+    try:
+        moves.append(
+            _by_own_edges(datum, edges.of(is_clear), views, o)
+        )
+    except DatumNotMeasuredError:
+        if not moves:
+            raise
+    move = _combined(moves, directions)
+    equations, _ = move_equations(datum.label, move, datum.locks)
+    return DatumEquations(
+        equations.label, "fit", equations.rows, equations.offsets_mm, equations.variances, equations.points,
+        equations.of, None, datum.locks, directions=directions,
+    )  # fmt: skip
+
+
+def _check_seen(datum: Datum, edges: EdgePoints, o: DatumOptions) -> None:
+    """Raise DatumNotMeasuredError unless enough edge points are seen in at least three photos."""
     if len(edges.points) < o.edges.min_points or len(np.unique(edges.view)) < 3:
         raise DatumNotMeasuredError(
-            f"{name}: {len(edges.points)} points of edges in it are seen in {len(np.unique(edges.view))} photos"
+            f"datum {datum.label} ({datum.feature}): {len(edges.points)} points of edges in it are seen in"
+            f" {len(np.unique(edges.view))} photos"
         )
+
+
+def _is_open(move: Move, directions: Array) -> bool:
+    """Whether a move leaves any of the directions (6,K) undetermined."""
+    return bool(len(move.undetermined) and np.linalg.norm(move.undetermined @ directions, axis=1).max() > 0.1)
+
+
+def _combined(moves: list[Move], directions: Array) -> Move:
+    """The mean of moves along the directions (6,3), weighted by covariance; all else is undetermined.
+
+    Where they differ by more than their covariances explain, the covariance is inflated (Birge 1932).
+    """
+    first, last = moves[0], moves[-1].at(moves[0].center_in_model)
+    values = [directions.T @ move.twist for move in (first, last)[: len(moves)]]
+    covariances = [directions.T @ move.covariance @ directions for move in (first, last)[: len(moves)]]
+    weights = [np.linalg.inv(one) for one in covariances]
+    covariance = np.linalg.inv(np.sum(weights, axis=0))
+    value = covariance @ np.sum([weight @ one for weight, one in zip(weights, values, strict=True)], axis=0)
+    if len(moves) > 1:
+        apart = values[0] - values[1]
+        squares = float(apart @ np.linalg.solve(covariances[0] + covariances[1], apart)) / len(apart)
+        covariance = covariance * max(1.0, squares)
+    return replace(
+        first, method="edges", twist=directions @ value, covariance=directions @ covariance @ directions.T,
+        undetermined=np.linalg.svd(directions.T)[2][directions.shape[1] :],
+    )  # fmt: skip
+
+
+def _by_own_edges(datum: Datum, edges: EdgePoints, views: PhotoViews, o: DatumOptions) -> Move:
+    """Motion of a datum plane by the edges in it. Raises DatumNotMeasuredError if they do not determine it."""
+    name = f"datum {datum.label} ({datum.feature})"
+    _check_seen(datum, edges, o)
     center = edges.points.mean(axis=0)
     radius_mm = float(np.sqrt(((edges.points - center) ** 2).sum(axis=1).mean()))
     place, fit, dark = np.eye(4), None, np.zeros(6)
@@ -64,17 +129,9 @@ def measure_plane_by_edges(datum: Datum, views: PhotoViews, o: DatumOptions) -> 
     move = Move(
         datum.component, "edges", center, twist, covariance, fit.undetermined, radius_mm, used, fit.residual_mm, 1.0
     )
-    directions = plane_directions(normal)
-    if len(fit.undetermined) and np.linalg.norm(fit.undetermined @ directions, axis=1).max() > 0.1:
+    if _is_open(move, plane_directions(np.array(datum.direction_in_model))):
         raise DatumNotMeasuredError(f"{name}: the edges in it do not determine its tilt; photograph it from more sides")
-    # Only the plane's directions count: through their correlation the others would move it.
-    held = directions @ directions.T
-    move = replace(move, twist=held @ twist, covariance=held @ covariance @ held)
-    equations, _ = move_equations(datum.label, move, datum.locks)
-    return DatumEquations(
-        equations.label, "fit", equations.rows, equations.offsets_mm, equations.variances, equations.points,
-        equations.of, None, datum.locks, directions=directions,
-    )  # fmt: skip
+    return move
 
 
 def plane_directions(normal: Array) -> Array:

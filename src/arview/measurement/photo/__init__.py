@@ -1,9 +1,10 @@
 """Positions of components measured in the photos themselves: from their surfaces (sweep) and from their edges."""
 
-from arview.measurement.photo.edges import EdgeOffsets, EdgePoints, edge_offsets
+from arview.measurement.photo.edges import EdgeOffsets, edge_offsets
 from arview.measurement.photo.measure import measure_components_in_photos
 from arview.measurement.photo.options import EdgeOptions, PhotoOptions, SweepOptions
 from arview.measurement.photo.rims import RimFit, fit_rim
+from arview.measurement.photo.rival_edges import EdgePoints
 from arview.measurement.photo.sweep import SweepOffsets, sweep_offsets
 from arview.measurement.photo.views import PhotoViews, load_views
 

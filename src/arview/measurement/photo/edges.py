@@ -22,27 +22,9 @@ from arview.measurement.photo.component import MeasuredComponent
 from arview.measurement.photo.fit import RigidFit, fit_rigid, move_rows
 from arview.measurement.photo.options import EdgeOptions
 from arview.measurement.photo.patches import near_others
+from arview.measurement.photo.rival_edges import EdgePoints, rival_px
 from arview.measurement.photo.views import PhotoViews
 from arview.measurement.types import Move, NotMeasured
-
-
-@dataclass(frozen=True)
-class EdgePoints:
-    """Predicted edge points in the photos that show them.
-
-    Attributes:
-        points: (N,3) in the model, mm.
-        tangents: (N,3) unit, in the model.
-        view: (N,) index of the photo.
-    """
-
-    points: Array
-    tangents: Array
-    view: NDArray[np.int64]
-
-    def of(self, which: NDArray[np.bool_] | NDArray[np.int64]) -> EdgePoints:
-        """The chosen points."""
-        return EdgePoints(self.points[which], self.tangents[which], self.view[which])
 
 
 @dataclass(frozen=True)
@@ -161,13 +143,15 @@ class ComponentEdges:
     def __init__(self, body: MeasuredComponent) -> None:
         self.body, self.views, self.options = body, body.views, body.options
         self._edges = mesh_edges(make_model(body.shape.name, (body.shape,)), CREASE_DEG)
-        self._predicted: tuple[Array, EdgePoints] | None = None
+        self._predicted: tuple[Array, EdgePoints, Array] | None = None
+        self._clear = (0.0, 0.0)
 
     def measure(self, start: Array | None = None) -> Move | NotMeasured:
         """Measure the component's move; ``start`` (4,4) is its approximate place, None searches around nominal."""
         o = self.options.edges
         place = np.eye(4) if start is None else start
-        edges = self.predicted(place)
+        crowded = self._choose_clear(place)
+        edges = self.predicted(place, self._clear[0])
         if len(edges.points) < o.min_points or len(np.unique(edges.view)) < 3:
             reason = "fewer than 3 photos show enough of its edges; take more photos of it"
             return NotMeasured(self.body.shape.name, "edges", reason, is_unseen=True)
@@ -178,11 +162,17 @@ class ComponentEdges:
             place = self._capture(edges, levels[0] if levels else 0)
         dark_mm = 0.0
         for turn, (level, reach_px) in enumerate(rounds):
-            edges = self.predicted(place)
+            # Between near edges the nearest step is the right one only once the place is known well; a step beyond the
+            # middle between an edge and its rival is the rival's.
+            is_fine = turn >= len(rounds) - o.fine_rounds
+            edges, rivals = self._clear_of(place, self._clear[is_fine])
             found = edge_offsets(edges, apply(place, self.body.center), self.views, reach_px, o, level)
             ok = found.seen & (found.slopes != 0.0)
+            if is_fine:
+                ok &= np.abs(found.offsets_mm) < 0.5 * rivals * found.mm_per_px
             if np.count_nonzero(ok) < o.min_points:
-                return self._not(f"only {np.count_nonzero(ok)} of {len(ok)} points of its edges are seen in the photos")
+                reason = f"only {np.count_nonzero(ok)} of {len(ok)} points of its edges are seen in the photos"
+                return NotMeasured(self.body.shape.name, "edges", reason, support=self._support(edges, place))
             before, dark_before_mm = place, dark_mm
             fit, dark_mm = self._fit(edges, found, ok, place, dark_mm, is_last=False)
             place = self.body.moved(place, fit.twist)
@@ -197,18 +187,53 @@ class ComponentEdges:
             reason = f"its edges are not seen where they should be: {100 * support:.0f} % more than by chance"
             return NotMeasured(self.body.shape.name, "edges", reason, support=support)
         by_poses = pose_gain(self.views, fit, edges.view[ok], found.pose_rows[ok])
-        return self.body.move("edges", fit, by_poses, place, o.systematic_px * self.body.px_mm, support)
+        systematic_px = float(np.hypot(o.systematic_px, o.crowded_px * crowded))
+        return self.body.move("edges", fit, by_poses, place, systematic_px * self.body.px_mm, support)
 
-    def predicted(self, place: Array) -> EdgePoints:
+    def _choose_clear(self, place: Array) -> float:
+        """Set the least distances of rivals in first and last rounds; return the share of points that are crowded.
+
+        Edges that another one runs beside are left out where the others suffice; else they are all used.
+        """
+        o = self.options.edges
+        for clear in ((o.first_rival_px, o.rival_px), (o.rival_px, o.rival_px)):
+            if all(self._suffices(self.predicted(place, one)) for one in clear):
+                self._clear = clear
+                return 0.0
+        self._clear = (0.0, 0.0)
+        every = len(self.predicted(place).points)
+        return 1.0 - len(self.predicted(place, o.rival_px).points) / max(1, every)
+
+    def _suffices(self, edges: EdgePoints) -> bool:
+        """Whether there are enough edge points, in enough photos."""
+        return len(edges.points) >= 2 * self.options.edges.min_points and len(np.unique(edges.view)) >= 3
+
+    def predicted(self, place: Array, clear_px: float = 0.0) -> EdgePoints:
         """Edge points that the photos should show with the component at a place; joints with others are left out.
 
         For a place that hardly differs from the previous one, the same points are moved along instead of rendered
         again.
+
+        Args:
+            place: (4,4) of the component.
+            clear_px: points beside which another edge of the component runs nearer than this are left out.
         """
+        return self._clear_of(place, clear_px)[0]
+
+    def _clear_of(self, place: Array, clear_px: float) -> tuple[EdgePoints, Array]:
+        """The points of `predicted`, and (N,) the distance to the nearest edge beside each, px; inf if far."""
+        edges, rivals = self._all_predicted(place)
+        kept = np.flatnonzero(rivals >= clear_px)
+        count = self.options.edges.max_points
+        kept = kept[:: int(np.ceil(len(kept) / count))] if len(kept) > count else kept
+        return edges.of(kept), rivals[kept]
+
+    def _all_predicted(self, place: Array) -> tuple[EdgePoints, Array]:
+        """All edge points at a place, and (N,) distance to the nearest edge beside each, px."""
         if self._predicted is not None and self.body.is_same(self._predicted[0], place):
-            before, edges = self._predicted
+            before, edges, rivals = self._predicted
             step = place @ invert(before)
-            return EdgePoints(apply(step, edges.points), edges.tangents @ step[:3, :3].T, edges.view)
+            return EdgePoints(apply(step, edges.points), edges.tangents @ step[:3, :3].T, edges.view), rivals
         o = self.options.edges
         corners = apply(place, self.body.corners)
         points, tangents, views = [], [], []
@@ -228,19 +253,16 @@ class ComponentEdges:
             tangents.append(found.tangents_in_model[good])
             views.append(np.full(np.count_nonzero(good), view))
         if not points:
-            return EdgePoints(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, dtype=np.int64))
-        all_points = np.concatenate(points)
-        apart = ~near_others(all_points, self.views.model, self.body.index, self.options.joint_mm)
-        kept = np.flatnonzero(apart)
-        if len(kept) > o.max_points:
-            kept = kept[:: int(np.ceil(len(kept) / o.max_points))]
+            return EdgePoints(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, dtype=np.int64)), np.zeros(0)
+        # Edges at joints are rivals too: the photos show them.
+        nominal = np.concatenate(points)
         edges = EdgePoints(
-            apply(place, all_points[kept]),
-            np.concatenate(tangents)[kept] @ place[:3, :3].T,
-            np.concatenate(views)[kept],
+            apply(place, nominal), np.concatenate(tangents) @ place[:3, :3].T, np.concatenate(views).astype(np.int64)
         )
-        self._predicted = (place, edges)
-        return edges
+        rivals = rival_px(edges, self.views, o.rival_reach_px)
+        apart = ~near_others(nominal, self.views.model, self.body.index, self.options.joint_mm)
+        self._predicted = (place, edges.of(apart), rivals[apart])
+        return self._predicted[1:]
 
     def _capture(self, edges: EdgePoints, level: int) -> Array:
         """Place within the capture range at which most edges have a step: all steps found vote for translations."""
@@ -292,9 +314,6 @@ class ComponentEdges:
             shares.append(int(np.count_nonzero(near)) / max(1, int(np.count_nonzero(found.seen))))
         chance = min(0.5 * (shares[1] + shares[2]), 0.9)
         return max(0.0, (shares[0] - chance) / (1.0 - chance))
-
-    def _not(self, reason: str) -> NotMeasured:
-        return NotMeasured(self.body.shape.name, "edges", reason)
 
 
 CREASE_DEG = 35.0

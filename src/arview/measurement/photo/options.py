@@ -51,6 +51,11 @@ class EdgeOptions:
     min_points: int = 40  # edge points that a measurement needs
     min_direction: float = 0.2  # share of a direction's information that must agree for it to be determined
     min_support: float = 0.25  # share of predicted points with a step at the fitted place, beyond chance
+    first_rival_px: float = 3.0  # in the first rounds, points with another edge nearer beside them are left out
+    rival_px: float = 2.0  # the same in the last rounds: blur merges nearer steps
+    rival_reach_px: float = 6.0  # an edge farther than this is no rival: the last rounds search half as far
+    fine_rounds: int = 3  # number of the last rounds
+    crowded_px: float = 0.5  # systematic standard deviation where all edges have others beside them: half their gap
     systematic_px: float = 0.03  # standard deviation of a common shift of all edges of a component: chamfers, light
 
 

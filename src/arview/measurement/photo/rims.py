@@ -8,10 +8,11 @@ import numpy as np
 
 from arview.errors import InputError
 from arview.geometry import Array
-from arview.measurement.photo.edges import EdgeOffsets, EdgePoints, edge_offsets, pose_gain
+from arview.measurement.photo.edges import EdgeOffsets, edge_offsets, pose_gain
 from arview.measurement.photo.fit import fit_rigid
 from arview.measurement.photo.options import EdgeOptions
 from arview.measurement.photo.patches import tangents_of
+from arview.measurement.photo.rival_edges import EdgePoints
 from arview.measurement.photo.views import PhotoViews
 
 

@@ -1,13 +1,33 @@
-"""Edges beside which another edge runs so near that a step of brightness may be that of either."""
+"""Predicted edge points, and how near another edge runs beside them: then a step may be that of either."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from arview.geometry import Array, apply
-from arview.measurement.photo.edges import EdgePoints
 from arview.measurement.photo.views import PhotoViews
+
+
+@dataclass(frozen=True)
+class EdgePoints:
+    """Predicted edge points in the photos that show them.
+
+    Attributes:
+        points: (N,3) in the model, mm.
+        tangents: (N,3) unit, in the model.
+        view: (N,) index of the photo.
+    """
+
+    points: Array
+    tangents: Array
+    view: NDArray[np.int64]
+
+    def of(self, which: NDArray[np.bool_] | NDArray[np.int64]) -> EdgePoints:
+        """The chosen points."""
+        return EdgePoints(self.points[which], self.tangents[which], self.view[which])
 
 
 def rival_px(edges: EdgePoints, views: PhotoViews, reach_px: float, same_px: float = 0.3) -> Array:
