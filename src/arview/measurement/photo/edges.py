@@ -150,7 +150,7 @@ class ComponentEdges:
         """Measure the component's move; ``start`` (4,4) is its approximate place, None searches around nominal."""
         o = self.options.edges
         place = np.eye(4) if start is None else start
-        crowded = self._choose_clear(place)
+        flanked = self._choose_clear(place)
         edges = self.predicted(place, self._clear[0])
         if len(edges.points) < o.min_points or len(np.unique(edges.view)) < 3:
             reason = "fewer than 3 photos show enough of its edges; take more photos of it"
@@ -187,11 +187,11 @@ class ComponentEdges:
             reason = f"its edges are not seen where they should be: {100 * support:.0f} % more than by chance"
             return NotMeasured(self.body.shape.name, "edges", reason, support=support)
         by_poses = pose_gain(self.views, fit, edges.view[ok], found.pose_rows[ok])
-        systematic_px = float(np.hypot(o.systematic_px, o.crowded_px * crowded))
+        systematic_px = float(np.hypot(o.systematic_px, o.flanked_px * flanked))
         return self.body.move("edges", fit, by_poses, place, systematic_px * self.body.px_mm, support)
 
     def _choose_clear(self, place: Array) -> float:
-        """Set the least distances of rivals in first and last rounds; return the share of points that are crowded.
+        """Set the least distances of rivals in first and last rounds; return the share of points that are flanked.
 
         Edges that another one runs beside are left out where the others suffice; else they are all used.
         """
