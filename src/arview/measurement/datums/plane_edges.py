@@ -53,9 +53,7 @@ def measure_plane_by_edges(
         form = np.diag(np.repeat([whole.radius_mm, 1.0], 3) ** -2.0) * o.plane_form_mm**2
         moves = [replace(whole, covariance=whole.covariance + form).at(edges.points.mean(axis=0))]
     try:
-        moves.append(
-            _by_own_edges(datum, edges.of(is_clear), views, o)
-        )
+        moves.append(_by_own_edges(datum, edges.of(is_clear), views, o))
     except DatumNotMeasuredError:
         if not moves:
             raise
