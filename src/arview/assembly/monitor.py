@@ -140,6 +140,7 @@ class AssemblyMonitor:
         camera: of the pictures.
         model: of the guide views.
         options: see `MonitorOptions`.
+        like: another monitor of the same part with the same options, whose preparation is shared.
 
     Attributes:
         is_placed: whether the pose is known to be that of the part; of one that rests on the base alone nothing is
@@ -149,12 +150,19 @@ class AssemblyMonitor:
     _state: MonitorState
 
     def __init__(
-        self, views: GuideViewSet, camera: Camera, model: Model, options: MonitorOptions | None = None
+        self,
+        views: GuideViewSet,
+        camera: Camera,
+        model: Model,
+        options: MonitorOptions | None = None,
+        like: AssemblyMonitor | None = None,
     ) -> None:
         self.options = options or MonitorOptions()
         self._views, self._camera, self._model = views, camera, model
         self._lines: PresentLines | None = None
-        self._turned = TurnedPoses(model.components, base_of(model), self.options.turned_poses)
+        self._turned = TurnedPoses(
+            model.components, base_of(model), self.options.turned_poses, None if like is None else like._turned
+        )
         self._has_components = len(model.components) > 1
         self._observer = ComponentObserver(views, camera, model, self.options.observation)
         boxes = np.array([one.bounds_in_model for one in model.components])

@@ -92,16 +92,26 @@ class TurnedPoses:
         components: of the part.
         base: index of the one that carries the others.
         options: see `TurnedPoseOptions`.
+        like: another of the same part, whose turns are shared.
     """
 
-    def __init__(self, components: Sequence[Component], base: int, options: TurnedPoseOptions | None = None) -> None:
+    def __init__(
+        self,
+        components: Sequence[Component],
+        base: int,
+        options: TurnedPoseOptions | None = None,
+        like: TurnedPoses | None = None,
+    ) -> None:
         self._options, self._components, self._base = options or TurnedPoseOptions(), components, base
+        self._like = like
         self._excluded: set[int] = set()
         self._sums: list[float] = []
 
     @cached_property
     def turns(self) -> list[Turn]:
         """All turns; few parts need them."""
+        if self._like is not None:
+            return self._like.turns
         return base_turns(self._components, self._base, self._options)
 
     @property

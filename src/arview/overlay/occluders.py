@@ -184,6 +184,10 @@ class OccluderFinder:
         common = 2.0 * float(np.partition(seen, len(seen) // 5)[len(seen) // 5])
         score = np.maximum(hue / (hue_variance + common), brightness_score)
         is_strange = known & (score > options.min_score)
+        # Near the surface's own edges and outline a small error of the pose shows the colour of what is beside.
+        is_sure = _sure(table, cells, observed, known & (score > options.sure_score), known, gain, noise)
+        if np.count_nonzero(is_sure) < max(1.0, options.min_sure_share * options.min_samples):
+            return is_strange.astype(np.uint8), np.zeros(cells.shape, dtype=np.uint8)
         is_part, weight = cells >= 0, known.astype(np.float32)
         is_edge = known & (_local_deviation(ratio, weight) > options.min_contrast)
         near = cv2.blur((is_strange | is_edge).astype(np.float32), (3, 3)) / np.maximum(cv2.blur(weight, (3, 3)), 1e-3)
@@ -192,10 +196,7 @@ class OccluderFinder:
         core = cv2.erode((wide | ~is_part).astype(np.uint8), _SQUARE) > 0
         candidate = (wide & is_part & (core | is_strange)).astype(np.uint8)
         count, labels, stats, _ = cv2.connectedComponentsWithStats(candidate, connectivity=8)
-        # Near the surface's own edges and outline a small error of the pose shows the colour of what is beside.
-        expected = np.where(known[..., None], table[cells, :3] * gain, np.nan)
-        certain = known & (score > options.sure_score) & ~_is_explained(observed, expected, is_part, noise)
-        sure = np.bincount(labels[certain], minlength=count)
+        sure = np.bincount(labels[is_sure], minlength=count)
         area = stats[:, cv2.CC_STAT_AREA]
         kept = (area >= options.min_samples) & (sure >= options.min_sure_share * area)
         kept[0] = False
@@ -236,22 +237,6 @@ class HiddenComponents:
         self._frames = np.clip(self._frames + step, 0, _HIDDEN_FRAMES)
         self.flags |= self._frames == _HIDDEN_FRAMES
         self.flags &= self._frames > 0
-
-
-def _is_explained(
-    observed: NDArray[np.float32],
-    expected: NDArray[np.float32],
-    is_part: NDArray[np.bool_],
-    noise: NDArray[np.float32],
-) -> NDArray[np.bool_]:
-    """Samples (R,C) whose colour is between those expected of their neighbours, or that have one beside the part.
-
-    ``expected`` (R,C,3) is NaN where nothing is known; ``noise`` as of `_differences`.
-    """
-    low = cv2.erode(np.nan_to_num(expected, nan=255.0), _SQUARE) * noise[2] - noise[1]
-    high = cv2.dilate(np.nan_to_num(expected, nan=0.0), _SQUARE) * noise[3] + noise[1]
-    is_between = ((observed >= low) & (observed <= high)).all(axis=2)
-    return np.asarray(is_between | (cv2.erode(is_part.astype(np.uint8), _SQUARE) == 0))
 
 
 def _local_deviation(values: NDArray[np.float32], weight: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -358,6 +343,38 @@ def _differences(
             damping = mean / np.sqrt(mean * mean + spread)
             ratio[row, column] = damping * np.log(min(max(light, np.float32(0.05)), np.float32(20.0)))
     return hue, variance, score, ratio
+
+
+@kernel
+def _sure(
+    table: NDArray[np.float32], cells: NDArray[np.int64], observed: NDArray[np.float32], strange: NDArray[np.bool_],
+    known: NDArray[np.bool_], gain: NDArray[np.float32], noise: NDArray[np.float32]
+) -> NDArray[np.bool_]:  # fmt: skip
+    """Those strange samples (R,C) whose colour is not between the colours expected of their neighbours.
+
+    Samples with a neighbour beside the part are none of them. ``noise`` is as in `_differences`.
+    """
+    rows, columns = cells.shape
+    sure = np.zeros((rows, columns), dtype=np.bool_)
+    for row in range(1, rows - 1):
+        for column in range(1, columns - 1):
+            if not strange[row, column]:
+                continue
+            is_inner, is_between = True, True
+            for k in range(3):
+                low, high = np.float32(255.0), np.float32(0.0)
+                for r in range(row - 1, row + 2):
+                    for c in range(column - 1, column + 2):
+                        if cells[r, c] < 0:
+                            is_inner = False
+                        elif known[r, c]:
+                            color = gain[k] * table[cells[r, c], k]
+                            low, high = min(low, color), max(high, color)
+                color = observed[row, column, k]
+                if color < low * noise[2] - noise[1] or color > high * noise[3] + noise[1]:
+                    is_between = False
+            sure[row, column] = is_inner and not is_between
+    return sure
 
 
 @kernel

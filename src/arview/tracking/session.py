@@ -59,7 +59,7 @@ class TrackingSession:
         initial_cam_from_model: (4,4) mm, rough pose in the first frame, which is refined instead of a search.
         guide_cam_from_model: (4,4) mm, guide pose. The part is first found when it is brought near this pose, not by
             a search, and by both after it has been lost for a while.
-        like: another session of the same guide views, camera and options, whose detector is shared.
+        like: another session of the same guide views, camera and options, whose detector and preparation are shared.
         serials: serial number of the part to which the labels belong, to be read from codes in the frames; None: codes
             are not read.
 
@@ -115,7 +115,7 @@ class TrackingSession:
         self._base: BaseDetection = (
             BaseDetection(views, camera, model, o.detector, o.base_detection) if like is None else like._base
         )
-        self.components = AssemblyMonitor(views, camera, model)
+        self.components = AssemblyMonitor(views, camera, model, like=None if like is None else like.components)
         self.appearance_memory = AppearanceMemory(views, camera)
         self._scene = SceneChange(views, camera, o.scene_change)
         self.identity = IdentityMonitor(views, camera, o.identity, serials)
