@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import copy
 from functools import cache
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from arview.assembly.observation import base_of
 from arview.assembly.present_lines import PresentLines
 from arview.cad.samples import sample_surface
 from arview.geometry import apply
@@ -15,6 +17,7 @@ from arview.refinement.view_model import PartView
 from helpers.synthetic import assembly, assembly_views, pose_from
 
 NAMES = [component.name for component in assembly().components]
+BASE = base_of(assembly())
 NONE = np.zeros(len(NAMES), dtype=bool)
 POSE = pose_from(10, 40, 520)
 
@@ -41,7 +44,7 @@ def near_points(part: PartView, name: str) -> int:
 
 @pytest.mark.slow
 def test_lines_of_an_absent_component_are_left_out_until_it_is_seen() -> None:
-    lines = PresentLines(assembly(), whole())
+    lines = PresentLines(assembly(), whole(), BASE)
     assert lines.update(NONE, NONE, POSE) is whole()
     before, kept = near_points(whole(), "post_1"), near_points(whole(), "block_1")
     assert before > 10 and kept > 10
@@ -57,8 +60,19 @@ def test_lines_of_an_absent_component_are_left_out_until_it_is_seen() -> None:
 
 @pytest.mark.slow
 def test_a_view_keeps_its_lines_where_nearly_all_would_go() -> None:
-    reduced = PresentLines(assembly(), whole()).update(~NONE, NONE, POSE)
+    reduced = PresentLines(assembly(), whole(), BASE).update(~NONE, NONE, POSE)
     view = assembly_views().nearest_index(POSE)
     first, last = whole().arrays.edge_starts[view : view + 2]
     assert last > first
     assert np.array_equal(reduced.arrays.edge_points[first:last], whole().arrays.edge_points[first:last])
+
+
+def test_where_all_but_the_base_are_absent_its_own_guide_views_are_used() -> None:
+    base = copy.copy(whole())
+    lines = PresentLines(assembly(), whole(), BASE)
+    others = np.arange(len(NAMES)) != BASE
+    assert lines.update(NONE, NONE, POSE, base) is whole()
+    assert lines.update(others, ~others, POSE, base) is base
+    assert lines.update(NONE, NONE, POSE, base) is base, "the others stay left out until they are seen"
+    assert lines.update(NONE, NONE, POSE) is not base
+    assert lines.update(NONE, only("post_1"), POSE, base) is not base

@@ -8,6 +8,7 @@ import pytest
 from arview.assembly.turned_poses import base_turns
 from arview.geometry import Array, apply
 from arview.pose import Presence
+from arview.refinement.view_model import PartView
 from arview.tracking import TrackingSession
 from arview.tracking.base_detection import BaseDetection
 from helpers.synthetic import CAMERA, assembly, assembly_views, block, changed, picture, pose_from
@@ -32,6 +33,21 @@ def test_a_bare_base_is_found() -> None:
         (found,) = detection.detect(picture(pose, BARE, seed=k, scene=k, noise=3.0), [0])
         assert found.quality >= detection.options.min_quality
         assert is_right(found.cam_from_model, pose)
+
+
+@pytest.mark.slow
+def test_guide_views_of_the_base_are_in_the_frame_of_the_part() -> None:
+    detection, whole = BaseDetection(assembly_views(), CAMERA, assembly()), PartView(assembly_views())
+    assert detection.part is None
+    assert detection.detector is not None
+    part = detection.part
+    assert part is not None and np.allclose(part.model_from_body, whole.model_from_body)
+    assert np.allclose(part.body_from_model @ part.model_from_body, np.eye(4))
+    low, high = PLATE.bounds_in_model
+    for points in (part.arrays.edge_points, part.arrays.contour_points, part.surface.points):
+        in_model = apply(part.model_from_body, points.astype(np.float64))
+        assert len(in_model) > 100 or points is part.surface.points
+        assert np.allclose(in_model.min(axis=0), low, atol=0.5) and np.allclose(in_model.max(axis=0), high, atol=0.5)
 
 
 @pytest.mark.slow

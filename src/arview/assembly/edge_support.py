@@ -15,7 +15,16 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.assembly.image_edges import ALIGNED, EdgePicture, EdgePictures, find_thin_edges, mark_owners, strength_at
+from arview.assembly.image_edges import (
+    ALIGNED,
+    NOBODYS,
+    SHARED,
+    EdgePicture,
+    EdgePictures,
+    find_thin_edges,
+    mark_owners,
+    strength_at,
+)
 from arview.assembly.visible_edges import VisibleEdges
 from arview.core.kernel import kernel
 from arview.geometry import Array
@@ -102,6 +111,21 @@ class EdgeSupport(NamedTuple):
     determined: Array
 
 
+class MeasuredSupport(NamedTuple):
+    """Edge support by all of a component's points, and by those alone that lie apart from other components' edges.
+
+    The picture may be smaller than the guide views, in which points were compared: there an image edge near some of
+    them may be a neighbour's. It is no evidence for the component, but one that is not found is evidence against it.
+
+    Attributes:
+        support: by all points.
+        unshared: by those apart; -1 where they are too few. The same as `support` where none is shared.
+    """
+
+    support: EdgeSupport
+    unshared: EdgeSupport
+
+
 class FoundPoints(NamedTuple):
     """Edge points in a picture: pixels (N,2), whether each lies on an image edge (N,), at which shift (2,) in px."""
 
@@ -149,7 +173,7 @@ class EdgeSupportMeter:
 
     def measure(
         self, image: NDArray[np.uint8], edges: VisibleEdges, cam_from_body: Array, intrinsics: Array, px_per_mm: float
-    ) -> EdgeSupport:
+    ) -> MeasuredSupport:
         """Edge support of all components.
 
         Args:
@@ -162,9 +186,10 @@ class EdgeSupportMeter:
         picture = self._pictures.of(image)
         projection = Projection(cam_from_body, intrinsics, 0.01 * self._diameter_mm)
         self._measured = picture, projection
-        return EdgeSupport(
-            *measure_edge_support(picture, edges, projection, self._shifts(px_per_mm), self.options.points)
+        all_points, unshared = measure_edge_support(
+            picture, edges, projection, self._shifts(px_per_mm), self.options.points
         )
+        return MeasuredSupport(EdgeSupport(*all_points), EdgeSupport(*unshared))
 
     def found_points(self, edges: VisibleEdges, is_wanted: NDArray[np.bool_]) -> FoundPoints:
         """Own edge points of some components (C,) in the picture measured last, at the best shift of all together.
@@ -226,7 +251,7 @@ def _disc(inner_px: float, outer_px: float, step: int) -> NDArray[np.int64]:
 @kernel
 def _best_shift(
     picture: EdgePicture, c: int, places: NDArray[np.int64], along: NDArray[np.int64], count: int,
-    scores: NDArray[np.float64], shifts: NDArray[np.int64], costs: NDArray[np.float64]
+    scores: NDArray[np.float64], shifts: NDArray[np.int64], costs: NDArray[np.float64], lowest: int
 ) -> float:  # fmt: skip
     """Share of ``count`` points on edges at the best shift, by the sum of scores less its cost.
 
@@ -236,6 +261,7 @@ def _best_shift(
         places, along: (K,3,2) pixels across the edge at each point, and (K,2) normals in 127ths.
         scores: (256,) by edge strength.
         shifts, costs: (S,2) px, and the share (S,) that each must gain.
+        lowest: see `strength_at`.
     """
     directions, strength, owners = picture.directions, picture.strength, picture.owners
     best = -1e9
@@ -244,7 +270,7 @@ def _best_shift(
         total = -costs[s] * count
         hits = 0
         for k in range(count):
-            e = strength_at(directions, strength, owners, c, places[k], along[k], shifts[s, 0], shifts[s, 1])
+            e = strength_at(directions, strength, owners, c, places[k], along[k], shifts[s, 0], shifts[s, 1], lowest)
             hits += e > 0
             total += scores[e]
             if total + (count - 1 - k) < best:
@@ -255,10 +281,13 @@ def _best_shift(
 
 
 @kernel
-def _contrast(image: NDArray[np.uint8], edges: VisibleEdges, projected: _Projected, c: int, reach_px: float) -> float:
+def _contrast(
+    image: NDArray[np.uint8], edges: VisibleEdges, is_own: NDArray[np.bool_], projected: _Projected, c: int,
+    reach_px: float
+) -> float:  # fmt: skip
     """Mean colour change across a component's outline in standard deviations, over runs of points; -1 without runs."""
     pixels, normals, depths = projected.pixels, projected.normals, projected.depths
-    sides, is_own = edges.sides, edges.is_own
+    sides = edges.sides
     first, last = edges.starts[c], edges.starts[c + 1]
     height, width = image.shape[:2]
     total = 0.0
@@ -299,10 +328,24 @@ def _contrast(image: NDArray[np.uint8], edges: VisibleEdges, projected: _Project
 
 
 @kernel
+def _unshared_points(edges: VisibleEdges, projected: _Projected, owners: NDArray[np.int16]) -> NDArray[np.bool_]:
+    """(N,) own points near which no edge of another component passes in this picture, see `mark_owners`."""
+    pixels = projected.pixels
+    height, width = owners.shape
+    is_unshared = edges.is_own.copy()
+    for i in range(pixels.shape[0]):
+        u, v = int(np.round(pixels[i, 0])), int(np.round(pixels[i, 1]))
+        if projected.depths[i] > 0 and 0 <= u < width and 0 <= v < height and owners[v, u] == SHARED:
+            is_unshared[i] = False
+    return is_unshared
+
+
+@kernel
 def _usable_points(
-    edges: VisibleEdges, projected: _Projected, c: int, shape: tuple[int, int], usable: NDArray[np.int64]
+    edges: VisibleEdges, is_own: NDArray[np.bool_], projected: _Projected, c: int, shape: tuple[int, int],
+    usable: NDArray[np.int64]
 ) -> tuple[int, float]:  # fmt: skip
-    """Own points of a component inside the picture: sets their indices in ``usable``.
+    """Own points (N,) of a component inside the picture: sets their indices in ``usable``.
 
     Returns:
         how many there are, 0 if too large a share is outside; and how many determine the position in the least
@@ -314,7 +357,7 @@ def _usable_points(
     inside = 0
     xx, yy, xy = 0.0, 0.0, 0.0
     for i in range(edges.starts[c], edges.starts[c + 1]):
-        if not edges.is_own[i]:
+        if not is_own[i]:
             continue
         own += 1
         if depths[i] > 0 and 3 < pixels[i, 0] < width - 4 and 3 < pixels[i, 1] < height - 4:
@@ -353,8 +396,8 @@ def _place_points(
 @kernel
 def measure_edge_support(
     picture: EdgePicture, edges: VisibleEdges, projection: Projection, shifts: Shifts, limits: PointLimits
-) -> EdgeSupport:  # fmt: skip
-    """`EdgeSupport` of all components.
+) -> MeasuredSupport:  # fmt: skip
+    """`MeasuredSupport` of all components.
 
     Args:
         picture: an `EdgePicture`; its working memory is overwritten.
@@ -374,23 +417,38 @@ def measure_edge_support(
     pixels = projected.pixels
     find_thin_edges(picture, limits.min_slope)
     mark_owners(pixels, projected.depths, edges.component, picture.owners)
-    found = np.full((4, count), -1.0)
+    is_unshared = _unshared_points(edges, projected, picture.owners)
+    found = np.full((8, count), -1.0)
     support = EdgeSupport(found[0], found[1], found[2], found[3])
+    unshared = EdgeSupport(found[4], found[5], found[6], found[7])
     usable = np.empty(pixels.shape[0], dtype=np.int64)
     places = np.empty((limits.max_points, 3, 2), dtype=np.int64)
     along = np.empty((limits.max_points, 2), dtype=np.int64)
     scores = np.arange(256) / (np.arange(256) + HALF_SCORE_STRENGTH)
     no_costs = np.zeros(shifts.far.shape[0])
     for c in range(count):
-        inside, determined = _usable_points(edges, projected, c, shape, usable)
+        inside, determined = _usable_points(edges, edges.is_own, projected, c, shape, usable)
         if inside < limits.min_points:
             continue
         kept = _place_points(projected, usable[:inside], places, along)
-        here = _best_shift(picture, c, places, along, kept, scores, shifts.near, shifts.near_costs)
+        here = _best_shift(picture, c, places, along, kept, scores, shifts.near, shifts.near_costs, SHARED)
         support.supported[c] = here
         support.displaced[c] = limits.typical_displaced
         if here < limits.well_supported:
-            support.displaced[c] = _best_shift(picture, c, places, along, kept, scores, shifts.far, no_costs)
-        support.contrast[c] = _contrast(picture.image, edges, projected, c, limits.color_reach_px)
+            support.displaced[c] = _best_shift(picture, c, places, along, kept, scores, shifts.far, no_costs, SHARED)
+        support.contrast[c] = _contrast(picture.image, edges, edges.is_own, projected, c, limits.color_reach_px)
         support.determined[c] = determined
-    return support
+        left, determined = _usable_points(edges, is_unshared, projected, c, shape, usable)
+        if left == inside:
+            found[4:, c] = found[:4, c]
+            continue
+        if left < limits.min_points:
+            continue
+        kept = _place_points(projected, usable[:left], places, along)
+        unshared.supported[c] = _best_shift(
+            picture, c, places, along, kept, scores, shifts.near, shifts.near_costs, NOBODYS
+        )
+        unshared.displaced[c] = support.displaced[c]
+        unshared.contrast[c] = _contrast(picture.image, edges, is_unshared, projected, c, limits.color_reach_px)
+        unshared.determined[c] = determined
+    return MeasuredSupport(support, unshared)

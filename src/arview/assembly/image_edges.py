@@ -17,6 +17,8 @@ ALIGNED = 14600
 """An edge has the direction of a point's normal when their product, both in 127ths, is above this: within 25°."""
 MARKED_PX = 2
 """Pixels around an edge point that are marked as its component's."""
+NOBODYS, SHARED = -1, -2
+"""Owners of pixels at which no component's edges pass, and those of several."""
 
 
 class EdgePicture(NamedTuple):
@@ -123,29 +125,30 @@ def find_thin_edges(picture: EdgePicture, min_slope: float) -> None:
 def mark_owners(
     pixels: NDArray[np.float64], depths: NDArray[np.float64], component: NDArray[np.int16], owners: NDArray[np.int16]
 ) -> None:  # fmt: skip
-    """Set ``owners`` (H,W) int16 to the component whose edges pass within two pixels; -1: none, -2: several."""
+    """Set ``owners`` (H,W) int16 to the component whose edges pass within two pixels, or `NOBODYS` or `SHARED`."""
     height, width = owners.shape
-    owners[:] = -1
+    owners[:] = NOBODYS
     for i in range(pixels.shape[0]):
         if depths[i] <= 0:
             continue
         x0, y0 = int(np.round(pixels[i, 0])), int(np.round(pixels[i, 1]))
         for y in range(max(0, y0 - MARKED_PX), min(height, y0 + MARKED_PX + 1)):
             for x in range(max(0, x0 - MARKED_PX), min(width, x0 + MARKED_PX + 1)):
-                if owners[y, x] == -1:
+                if owners[y, x] == NOBODYS:
                     owners[y, x] = component[i]
                 elif owners[y, x] != component[i]:
-                    owners[y, x] = -2
+                    owners[y, x] = SHARED
 
 
 @kernel
 def strength_at(
     directions: NDArray[np.int8], strength: NDArray[np.uint8], owners: NDArray[np.int16], c: int,
-    places: NDArray[np.int64], normal: NDArray[np.int64], dx: int, dy: int
+    places: NDArray[np.int64], normal: NDArray[np.int64], dx: int, dy: int, lowest: int
 ) -> Any:  # fmt: skip
     """Strongest edge within 25° of a normal at three places (3,2), shifted; edges of other components do not count.
 
-    ``normal`` (2,) is in 127ths. There are no branches on the edges, because they cannot be predicted.
+    ``normal`` (2,) is in 127ths. Edges at pixels of nobody count; those at shared ones only if ``lowest`` is
+    `SHARED`. There are no branches on the edges, because they cannot be predicted.
     """
     height, width = strength.shape
     best = np.int64(0)
@@ -155,6 +158,6 @@ def strength_at(
             continue
         owner = owners[y, x]
         along = abs(directions[0, y, x] * normal[0] + directions[1, y, x] * normal[1])
-        counts = (along > ALIGNED) & ((owner < 0) | (owner == c))
+        counts = (along > ALIGNED) & (((owner < 0) & (owner >= lowest)) | (owner == c))
         best = max(best, np.int64(strength[y, x]) * counts)
     return best

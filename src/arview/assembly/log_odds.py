@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from arview.assembly.bare_place import BarePlaces
-from arview.assembly.edge_support import EdgeSupport
+from arview.assembly.edge_support import EdgeSupport, MeasuredSupport
 from arview.geometry import Array
 from arview.weights import load_weights
 
@@ -75,12 +75,14 @@ class Evidence(NamedTuple):
 
     Attributes:
         support: of the edges.
+        unshared: the same by points apart from other components' edges.
         network: (C,) log odds against the nominal placement by the presence network, NaN where it has not predicted.
         places: what is seen at the place; -1 where that was not measured.
         base: share of the edge points of trusted components that lie on image edges.
     """
 
     support: EdgeSupport
+    unshared: EdgeSupport
     network: Array
     places: BarePlaces
     base: float
@@ -117,8 +119,30 @@ def place_weights() -> PlaceWeights:
     return PlaceWeights(absent, present)
 
 
-def edge_log_odds(support: EdgeSupport, options: LogOddsOptions) -> Array:
-    """Log odds (C,) by edges alone, in proportion to how well the edges determine a component's position."""
+def edge_log_odds(measured: MeasuredSupport, options: LogOddsOptions) -> Array:
+    """Log odds (C,) by edges alone, 0 for components that are not visible."""
+    support, unshared = measured
+    by_edges = np.where(support.supported >= 0.0, _edge_log_odds(support, options), 0.0)
+    return _without_neighbours(by_edges, _edge_log_odds(unshared, options), unshared)
+
+
+def place_log_odds(evidence: Evidence, options: LogOddsOptions) -> Array:
+    """Log odds (C,) by all measurements, 0 for components that are not visible."""
+    by_place = np.where(evidence.support.supported >= 0.0, place_odds(evidence, options).log_odds, 0.0)
+    by_unshared = place_odds(evidence._replace(support=evidence.unshared), options).log_odds
+    return _without_neighbours(by_place, by_unshared, evidence.unshared)
+
+
+def _without_neighbours(log_odds: Array, by_unshared: Array, unshared: EdgeSupport) -> Array:
+    """Log odds (C,) of which those for a component are no stronger than by its unshared points: edges near the others
+    may be a neighbour's.
+    """
+    known = np.where(unshared.supported >= 0.0, np.minimum(by_unshared, 0.0), 0.0)
+    return np.where(log_odds < 0.0, np.maximum(log_odds, known), log_odds)
+
+
+def _edge_log_odds(support: EdgeSupport, options: LogOddsOptions) -> Array:
+    """Log odds (C,) by one support, in proportion to how well the edges determine a component's position."""
     w = edge_weights()
     contrast = np.where(
         support.contrast < 0.0, options.typical_contrast, np.minimum(support.contrast, options.max_contrast)
@@ -138,7 +162,7 @@ def place_odds(evidence: Evidence, options: LogOddsOptions) -> PlaceOdds:
 
 def evidence_features(evidence: Evidence, options: LogOddsOptions) -> Array:
     """Inputs (C,F) of the model of places, see `FEATURES`; measurements that are not known are 0."""
-    o, (support, network, places, base) = options, evidence
+    o, (support, _, network, places, base) = options, evidence
     contrast = np.where(support.contrast < 0.0, o.typical_contrast, np.minimum(support.contrast, o.max_contrast))
     determined = np.maximum(support.determined, 0.0)
     reliable = determined / (determined + o.half_reliable_points)

@@ -302,21 +302,22 @@ class AssemblyMonitor:
             self._turned.compare(cam_from_model, lambda pose: self._observer.pose_evidence(image, pose))
         state.is_missing = state.is_mismatched & (state.is_missing | (state.log_odds > o.missing_log_odds))
 
-    def present_lines(self, part: PartView, cam_from_model: Array) -> PartView:
+    def present_lines(self, part: PartView, cam_from_model: Array, base_part: PartView | None = None) -> PartView:
         """The guide views of the part without the lines of components that probably are not where the CAD has them.
 
         Args:
             part: all guide views, always the same.
             cam_from_model: (4,4) mm pose of the present frame.
+            base_part: guide views of the base alone in the frame of the part's; None: there are none.
         """
-        self._lines = self._lines or PresentLines(self._model, part)
-        return self._lines.update(self._is_suspect(), self._state.is_verified, cam_from_model)
+        self._lines = self._lines or PresentLines(self._model, part, self._observer.base)
+        return self._lines.update(self._is_suspect(), self._state.is_verified, cam_from_model, base_part)
 
-    def base_lines(self, part: PartView, cam_from_model: Array) -> PartView:
+    def base_lines(self, part: PartView, cam_from_model: Array, base_part: PartView | None = None) -> PartView:
         """As `present_lines` where only the base was found: the others are left out until they are seen."""
-        self._lines = self._lines or PresentLines(self._model, part)
+        self._lines = self._lines or PresentLines(self._model, part, self._observer.base)
         is_base = np.arange(len(self._state.log_odds)) == self._observer.base
-        return self._lines.update(~is_base, is_base, cam_from_model)
+        return self._lines.update(~is_base, is_base, cam_from_model, base_part)
 
     def is_same_but_turned(self, a: Array, b: Array, same_mm: float, same_deg: float) -> bool:
         """Whether two poses (4,4) are the same within bounds, or would be if the base had no other components."""

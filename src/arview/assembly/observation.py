@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from arview.assembly.bare_place import BarePlaceMeter, BarePlaceOptions
 from arview.assembly.edge_support import EdgeSupportMeter, EdgeSupportOptions
-from arview.assembly.log_odds import Evidence, LogOddsOptions, edge_log_odds, place_odds
+from arview.assembly.log_odds import Evidence, LogOddsOptions, edge_log_odds, place_log_odds, place_odds
 from arview.assembly.placement_search import Alternatives, PlacementSearch, PlacementSearchOptions
 from arview.assembly.placements import PlacementOptions, alternative_placements
 from arview.assembly.presence_net import PartImage, PresenceNet, component_crops
@@ -165,7 +165,7 @@ class ComponentObserver:
         evidence, picture = self.measure(image, cam_from_model, known)
         is_visible = evidence.support.supported >= 0.0
         odds = place_odds(evidence, o.log_odds)
-        by_place = np.where(is_visible, odds.log_odds, 0.0)
+        by_place = place_log_odds(evidence, o.log_odds)
         occluded = np.where(is_visible, odds.occluded, 0.0)
         # The base carries the pose: where it is not seen, nothing is known.
         by_place[self.base] = min(by_place[self.base], 0.0)
@@ -196,9 +196,9 @@ class ComponentObserver:
         o = self._options
         crop = self._part_crop(image, cam_from_model)
         edges = self._visible_edges.nearest(cam_from_model)
-        support = self._meter.measure(crop.image, edges, crop.cam_from_body, crop.intrinsics, crop.px_per_mm)
-        is_visible = support.supported >= 0.0
-        by_edges = np.where(is_visible, edge_log_odds(support, o.log_odds), 0.0)
+        measured = self._meter.measure(crop.image, edges, crop.cam_from_body, crop.intrinsics, crop.px_per_mm)
+        is_visible = measured.support.supported >= 0.0
+        by_edges = edge_log_odds(measured, o.log_odds)
         is_doubtful = is_visible & (by_edges > o.confirmed_log_odds)
         is_trusted = known.is_present | (by_edges < o.trusted_log_odds)
         is_trusted[self.base] = True
@@ -213,15 +213,15 @@ class ComponentObserver:
             picture = PartImage(crop.image, self._edge_net.predict(crop.image), crop.intrinsics, crop.cam_from_body)
             network = self._network_log_odds(picture, known, is_doubtful)
         base = float(np.mean(points.is_found)) if len(points.is_found) else 0.0
-        return Evidence(support, network, places, base), picture
+        return Evidence(*measured, network, places, base), picture
 
     def pose_evidence(self, image: NDArray[np.uint8], cam_from_model: Array) -> TurnEvidence:
         """How much of the base, and of components at their nominal placements, a picture shows at a pose."""
         o = self._options
         crop = self._part_crop(image, cam_from_model)
         edges = self._visible_edges.nearest(cam_from_model)
-        support = self._meter.measure(crop.image, edges, crop.cam_from_body, crop.intrinsics, crop.px_per_mm)
-        by_edges = np.where(support.supported >= 0.0, edge_log_odds(support, o.log_odds), 0.0)
+        measured = self._meter.measure(crop.image, edges, crop.cam_from_body, crop.intrinsics, crop.px_per_mm)
+        by_edges = edge_log_odds(measured, o.log_odds)
         is_base = np.arange(self._count) == self.base
         points = self._meter.found_points(edges, is_base)
         seen = np.where(is_base, 0.0, np.clip(-by_edges, 0.0, o.max_seen))

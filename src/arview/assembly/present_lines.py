@@ -2,7 +2,8 @@
 
 The outline and the edges of absent components are not in the picture; a tracker that expects them loses its evidence,
 and in the end the part. Their points are therefore replaced by points of the other components in the same view, so
-that the arrays keep their sizes. Only views near the present direction are changed, when they are first needed.
+that the arrays keep their sizes. Only views near the present direction are changed, when they are first needed. Lines
+that absent components would hide are not among them; where all but the base are absent, its own guide views have them.
 """
 
 from __future__ import annotations
@@ -46,18 +47,26 @@ class PresentLines:
     Args:
         model: of the part.
         part: its guide views; they are not changed.
+        base: index of the component that carries the others.
         options: see `PresentLinesOptions`.
     """
 
-    def __init__(self, model: Model, part: PartView, options: PresentLinesOptions | None = None) -> None:
+    def __init__(self, model: Model, part: PartView, base: int, options: PresentLinesOptions | None = None) -> None:
         self._options = options or PresentLinesOptions()
         self._model, self._whole = model, part
         self._reduced: PartView | None = None
         self._is_absent = np.zeros(len(model.components), dtype=bool)
+        self._is_base = np.arange(len(model.components)) == base
         self._tree: cKDTree | None = None
         self._changed: set[int] = set()
 
-    def update(self, is_missing: NDArray[np.bool_], is_present: NDArray[np.bool_], cam_from_model: Array) -> PartView:
+    def update(
+        self,
+        is_missing: NDArray[np.bool_],
+        is_present: NDArray[np.bool_],
+        cam_from_model: Array,
+        base_part: PartView | None = None,
+    ) -> PartView:
         """The guide views to be used at a pose.
 
         A component that was missing stays left out until it is seen, whatever becomes of the track in between.
@@ -65,6 +74,7 @@ class PresentLines:
         Args:
             is_missing, is_present: (C,) components that are known not to be there, and to be there.
             cam_from_model: (4,4) mm.
+            base_part: guide views of the base in the frame of the part's; None: there are none.
         """
         is_absent = (self._is_absent | is_missing) & ~is_present
         if not np.array_equal(is_absent, self._is_absent):
@@ -72,6 +82,8 @@ class PresentLines:
             self._restore()
         if self._tree is None:
             return self._whole
+        if base_part is not None and np.array_equal(is_absent, ~self._is_base):
+            return base_part
         if self._reduced is None:
             self._reduced = copy.copy(self._whole)
             copies = {name: array.copy() for name, array in self._whole.arrays._asdict().items()}

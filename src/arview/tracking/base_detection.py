@@ -7,6 +7,7 @@ where the search for the whole part fails; a pose found by it says nothing of th
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass, field, replace
 
 import cv2
@@ -16,10 +17,11 @@ from numpy.typing import NDArray
 from arview.assembly.observation import base_of
 from arview.cad.model import Model, make_model
 from arview.camera import Camera
-from arview.detection.detector import Detection, Detector, DetectorOptions, options_for
-from arview.geometry import Array, apply
+from arview.detection.detector import Detection, Detector, DetectorOptions, local_search_for, options_for
+from arview.geometry import Array, apply, rigid
 from arview.guideviews import GuideViewOptions, GuideViewSet
 from arview.guideviews.cache import cached_guide_views
+from arview.refinement.view_model import PartView
 
 
 @dataclass(frozen=True)
@@ -72,6 +74,7 @@ class BaseDetection:
         self._views, self._camera, self._model = views, camera, model
         self._detector_options = detector
         self._detector: Detector | None = None
+        self._part: PartView | None = None
         self._full_searches = self._frames_since = 0
 
     @property
@@ -131,5 +134,28 @@ class BaseDetection:
             options = self._detector_options or options_for(views)
             # A search that ends early must not end with a pose that is not accepted.
             options = replace(options, min_quick_quality=max(options.min_quick_quality, self.options.min_quality))
-            self._detector = Detector(views, self._camera, options)
+            local = local_search_for(views, self._camera, options)
+            self._detector = Detector(views, self._camera, options, local=local)
+            self._part = _about(local.refiner.part, self._views.center_in_model)
         return self._detector
+
+    @property
+    def part(self) -> PartView | None:
+        """Guide views of the base about the centre of the part, for the tracker; None before the first search.
+
+        Those of the whole part lack the lines of the base that the other components hide.
+        """
+        return self._part
+
+
+def _about(part: PartView, center_in_model: Array) -> PartView:
+    """Guide views about another centre (3,) in mm, which becomes the origin of their frame."""
+    shifted, shift_mm = copy.copy(part), part.views.center_in_model - center_in_model
+    arrays, offset = part.arrays, shift_mm.astype(np.float32)
+    shifted.arrays = arrays._replace(
+        contour_points=arrays.contour_points + offset, edge_points=arrays.edge_points + offset
+    )
+    shifted.surface = part.surface._replace(points=part.surface.points + offset)
+    shifted.model_from_body = rigid(np.eye(3), center_in_model)
+    shifted.body_from_model = rigid(np.eye(3), -np.asarray(center_in_model))
+    return shifted

@@ -21,7 +21,6 @@ from arview.camera import Camera
 from arview.camera.undistort import FrameView
 from arview.core.checks import check_type
 from arview.detection.detector import Detection, Detector, RejectedHypothesis, local_search_for
-from arview.detection.scene_change import SceneChange
 from arview.detection.search.local_search import LocalSearch
 from arview.errors import MismatchError
 from arview.fiducials.serial_code import SerialNumbers
@@ -36,6 +35,7 @@ from arview.tracking.estimate import Estimate
 from arview.tracking.guided_init import GuidedInit
 from arview.tracking.identity import IdentityMonitor
 from arview.tracking.pose_recheck import LocalSearchRecheck
+from arview.tracking.search_plan import SearchPlan
 from arview.tracking.session_options import SessionOptions
 from arview.tracking.session_state import Event, SessionState
 from arview.tracking.several.specimens import hide_specimens, is_same_specimen
@@ -117,7 +117,7 @@ class TrackingSession:
         )
         self.components = AssemblyMonitor(views, camera, model, like=None if like is None else like.components)
         self.appearance_memory = AppearanceMemory(views, camera)
-        self._scene = SceneChange(views, camera, o.scene_change)
+        self._search_plan = SearchPlan(views, camera, o)
         self.identity = IdentityMonitor(views, camera, o.identity, serials)
         self._state = SessionState()
 
@@ -280,7 +280,7 @@ class TrackingSession:
             return self._initialize(image, self._initial)
         if s.state == TrackingState.SEARCHING and self._guide is not None:
             return self._align(image, self._guide)
-        searches = self._plan(image)
+        searches = self._search_plan.searches(image, s, self.detector)
         is_resting = searches == []
         searched = hide_specimens(image, self.others, self.views, self.camera)
         detections = self._detect_remembered(searched) if is_resting else self._detect(searched, searches)
@@ -323,7 +323,8 @@ class TrackingSession:
 
     def _expect_base(self, cam_from_model: Array) -> None:
         """Let the tracker expect no component but the base until they are seen."""
-        self.tracker.refiner.part = self.components.base_lines(self._local.refiner.part, cam_from_model)
+        whole = self._local.refiner.part
+        self.tracker.refiner.part = self.components.base_lines(whole, cam_from_model, self._base.part)
 
     def _is_other(self, cam_from_model: Array) -> bool:
         """Whether a pose (4,4) is that of another specimen."""
@@ -356,42 +357,6 @@ class TrackingSession:
         self.tracker.start(image, cam_from_model)
         self.components.reset()
         return self.tracker.track(image)
-
-    def _plan(self, image: NDArray[np.uint8]) -> list[int] | None:
-        """The searches of the detector in this frame; None: all until one gives a sure result, empty: none.
-
-        A lost part is not searched for soon after a search, nor where nothing has changed since. The thorough search
-        for it is spread over several frames.
-        """
-        o, s = self.options, self._state
-        frame = s.frames_without_pose
-        if s.state == TrackingState.SEARCHING:
-            return None if frame % (2 * o.search_every) == 1 else [0]
-        if frame > o.eager_frames and frame - s.last_search_frame < o.search_every:
-            return []
-        picture = self._scene.reduced(image)
-        is_known = s.searched_picture is not None and not self._scene.has_changed(s.searched_picture, picture)
-        is_known = is_known and frame - s.last_search_frame < o.max_unchanged_frames
-        if not is_known:
-            # Compared with this picture from now on, so that slow changes add up.
-            s.searched_picture, s.parts_left = picture, o.thorough_parts
-        searches = [] if is_known and frame > o.eager_frames else [0]
-        if s.parts_left and (s.thorough_part or frame >= max(s.next_thorough_frame, 2 * o.search_every)):
-            # A wider search finds what the quick one would find.
-            searches = self._next_thorough_part() or searches
-        if searches:
-            s.last_search_frame = frame
-        return searches
-
-    def _next_thorough_part(self) -> list[int]:
-        """The next part of the thorough search for a lost part; after the last one it is done for a while."""
-        o, s = self.options, self._state
-        part = np.array_split(self.detector.wider_searches, o.thorough_parts)[s.thorough_part]
-        s.thorough_part = (s.thorough_part + 1) % o.thorough_parts
-        s.parts_left -= 1
-        if s.thorough_part == 0:
-            s.next_thorough_frame = s.frames_without_pose + o.thorough_every
-        return [int(k) for k in part]
 
     def _detect(self, image: NDArray[np.uint8], searches: list[int] | None) -> list[Detection]:
         """Detect the part in the whole picture, with the remembered appearance as a hint."""
@@ -483,7 +448,8 @@ class TrackingSession:
         s = self._state
         s.is_supported = s.state == TrackingState.TRACKED
         self.components.update(image, estimate.cam_from_model, estimate.quality, s.is_supported)
-        self.tracker.refiner.part = self.components.present_lines(self._local.refiner.part, estimate.cam_from_model)
+        whole, pose = self._local.refiner.part, estimate.cam_from_model
+        self.tracker.refiner.part = self.components.present_lines(whole, pose, self._base.part)
         reasons = [reason, *self.components.mismatches] if reason else [*self.components.mismatches]
         if self.components.uncertain and not reasons:
             reasons = [f"in doubt: {', '.join(self.components.uncertain)}"]
