@@ -229,3 +229,21 @@ def test_a_new_inspection_has_the_values_of_a_list(model: Model, tmp_path: Path)
         new_inspection(_part(model), [ListedComponent("nut", np.zeros(3), np.zeros(3), None)], None, "cmm.csv")
     with pytest.raises(InputError, match="block_1: has no U"):
         new_inspection(_part(model), [ListedComponent("block_1", np.zeros(3), np.zeros(3), None)], None, "cmm.csv")
+
+
+def test_the_command_compare(found: Inspection, tmp_path: Path) -> None:
+    """The list comes first; the inspection is the one beside it unless it is named."""
+    path = _list(tmp_path, found, {"block_1": (0.02, 0.0, 0.0), "block_2": (0.0, 0.01, 0.0)})
+    alone = CliRunner().invoke(main, ["compare", str(path)])
+    assert alone.exit_code == 64 and "holds no inspection.json" in alone.output
+    save_inspection(found, tmp_path / "inspection.json")
+    result = CliRunner().invoke(main, ["compare", str(path), "-o", str(tmp_path / "out.json")])
+    assert result.exit_code == 0, result.output
+    assert "E_n ≤ 1 for 2 of 2 components" in result.output
+    record = json.loads((tmp_path / "out.json").read_text(encoding="utf-8"))
+    assert [one["name"] for one in record["components"]] == ["block_1", "block_2"]
+    _list(tmp_path, found, {"block_1": (0.5, 0.0, 0.0)})
+    apart = CliRunner().invoke(main, ["compare", str(path), str(tmp_path)])
+    assert apart.exit_code == 1 and "differs" in apart.output
+    absent = CliRunner().invoke(main, ["compare", str(tmp_path / "none.csv"), str(tmp_path)])
+    assert absent.exit_code == 64 and "no such file" in absent.output

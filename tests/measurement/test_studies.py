@@ -12,8 +12,11 @@ from arview.measurement.plot import Chart, save_picture, stack
 from arview.measurement.studies import (
     density_study,
     displacement_study,
+    minima_study,
     noise_study,
+    registration_study,
     rice_study,
+    sampling_study,
     threshold_study,
     write_study,
 )
@@ -118,3 +121,32 @@ def test_charts_put_values_where_they_belong():
     empty = Chart("t", "x", "y", True, True)
     empty.add([1.0, 10.0], [0.0, np.nan])
     assert empty.draw().shape == (600, 960, 3)
+
+
+@pytest.mark.slow
+def test_registration_study_has_every_way_on_the_same_clouds():
+    study = registration_study(is_quick=True)
+    rows = table(study)
+    assert {row["way"].split(",")[0] for row in rows} == {"exact surface", "point to point", "point to plane"}
+    exact = next(row for row in rows if row["way"] == "exact surface" and row["noise_mm"] == 0.0)
+    assert exact["largest_error_um"] < 0.1
+    for row in rows:
+        if row["noise_mm"] == 0.4:
+            assert 1.0 < row["mean_error_um"] < 120.0, row
+
+
+@pytest.mark.slow
+def test_sampling_study_by_information_beats_chance():
+    rows = {(row["method"], row["kept"]): row for row in table(sampling_study(is_quick=True))}
+    assert len(rows) == 10
+    assert rows["by information", 100]["rms_up_um"] < rows["random", 100]["rms_up_um"]
+
+
+@pytest.mark.slow
+def test_minima_study_finds_the_grooves():
+    study = minima_study(is_quick=True)
+    rows = table(study)
+    assert {row["post"] for row in rows} == {"round", "hexagonal", "stepped", "grooved"}
+    assert all(0.0 <= row["found"] <= 1.0 for row in rows)
+    near = [row["found"] for row in rows if row["displacement_mm"] == 1.0 and row["way"] == "several starts"]
+    assert len(near) == 8 and np.mean(near) > 0.7

@@ -1,4 +1,4 @@
-"""The commands study …: accuracy of the registration, on simulated posts."""
+"""The commands study …: accuracy of the registration, on simulated posts and on clouds."""
 
 from __future__ import annotations
 
@@ -23,18 +23,19 @@ SEED = click.option("--seed", type=int, default=0, show_default=True, help="The 
 
 
 @main.group(
-    short_help="Simulate registrations of posts.",
+    short_help="Studies of the registration, on simulated posts and clouds.",
     epilog="""\b
 Examples:
   arview study noise -o studies/
   arview study density --quick
+  arview study registration --cloud scan.ply --part part.toml
 
 \b
 Each command writes CSV and PNG to FOLDER and prints a summary. The posts are 16 mm across and 40 mm
-high; measured points are sampled at random from their surface.""",
+high; measured points are sampled at random from their surface. registration and bias also take a cloud.""",
 )
 def study() -> None:
-    """Simulate registrations of posts: bias, spread, and what they depend on."""
+    """Bias and spread of registrations, and what they depend on."""
 
 
 @study.command(
@@ -135,6 +136,109 @@ def threshold(output: str, quick: bool, seed: int) -> None:
     from arview.measurement.studies import threshold_study
 
     _write(lambda: threshold_study(quick, seed), output)
+
+
+@study.command(
+    "registration",
+    short_help="Classical ICP beside the exact surface, on the same clouds.",
+    epilog="""\b
+Examples:
+  arview study registration --quick
+  arview study registration --cloud scan.ply --part part.toml
+  arview study registration --cloud scan.ply --part samples/plate/part.toml --truth samples/plate/truth.json
+
+\b
+The classical way cuts reference and measured points out around the nominal place, averages both on a
+0.5 mm grid, and registers by point-to-point, then point-to-plane ICP (Open3D). With --cloud, every
+component of PART in that cloud is placed both ways instead; --truth is the truth.json of a sample.""",
+)
+@OUTPUT
+@QUICK
+@SEED
+@click.option("--runs", type=click.IntRange(min=1), metavar="N", help="Runs of each row.  [default: 50]")
+@click.option("--cloud", metavar="FILE", help="A cloud in any frame and format of `arview measure --cloud`.")
+@click.option("--part", metavar="PART", help="Part or CAD file of the cloud.")
+@click.option("--truth", metavar="JSON", help="True positions of the components.")
+def registration(
+    output: str, quick: bool, seed: int, runs: int | None, cloud: str | None, part: str | None, truth: str | None
+) -> None:
+    """A post displaced by 1 mm with 0 to 0.4 mm of noise, or the components of a cloud: every way in one table."""
+    from arview.measurement.studies import cloud_registration_study, registration_study
+
+    if (cloud is None) != (part is None) or (truth is not None and cloud is None):
+        raise InputError("--cloud needs --part, and --truth needs both")
+    if cloud is not None and part is not None:
+        _write(lambda: cloud_registration_study(cloud, part, truth), output)
+    else:
+        _write(lambda: registration_study(quick, seed, runs), output)
+
+
+@study.command(
+    short_help="Down-sampling: grid, random, by information.",
+    epilog="""\b
+Examples:
+  arview study sampling --quick
+  arview study sampling -o studies/ --seed 1""",
+)
+@OUTPUT
+@QUICK
+@SEED
+def sampling(output: str, quick: bool, seed: int) -> None:
+    """Error of a post's position by number of points kept: on a grid, at random, and by their information.
+
+    The post is scanned from one side, with many more points on what faces the scanner.
+    """
+    from arview.measurement.studies import sampling_study
+
+    _write(lambda: sampling_study(quick, seed), output)
+
+
+@study.command(
+    short_help="Local minima over 1 to 9 mm for four kinds of posts.",
+    epilog="""\b
+Examples:
+  arview study minima --quick
+  arview study minima -o studies/ --seed 1""",
+)
+@OUTPUT
+@QUICK
+@SEED
+def minima(output: str, quick: bool, seed: int) -> None:
+    """Share of the runs that end at the true place: round, hexagonal, stepped and grooved posts, moved by 1 to 9 mm.
+
+    Each is registered from its nominal place alone, from several starts, and by classical ICP.
+    """
+    from arview.measurement.studies import minima_study
+
+    _write(lambda: minima_study(quick, seed), output)
+
+
+@study.command(
+    "bias",
+    short_help="Map of a cloud's mean signed error beside its noise.",
+    epilog="""\b
+Examples:
+  arview study bias scan.ply --part part.toml
+  arview study bias out/cloud.ply --part samples/plate/part.toml --truth samples/plate/truth.json --quick
+
+\b
+CLOUD is in any frame and format of `arview measure --cloud`. Its signed distances to the CAD, with the
+components at their true places if --truth is given, are averaged in cells of the surface. What varies from
+cell to cell by more than the noise of their points allows is systematic: more points do not average it out.""",
+)
+@click.argument("cloud", metavar="CLOUD")
+@click.option("--part", required=True, metavar="PART", help="Part or CAD file.")
+@click.option("--truth", metavar="JSON", help="True positions of the components; default: nominal.")
+@click.option("--cell", type=click.FloatRange(0.5, 100.0), default=5.0, show_default=True, metavar="MM",
+              help="Size of a cell.")  # fmt: skip
+@OUTPUT
+@QUICK
+@SEED
+def bias(cloud: str, part: str, truth: str | None, cell: float, output: str, quick: bool, seed: int) -> None:
+    """Mean signed error of CLOUD by place, beside the noise of its points."""
+    from arview.measurement.studies import bias_study
+
+    _write(lambda: bias_study(cloud, part, truth, cell, quick, seed), output)
 
 
 def _write(make: Callable[[], Study], output: str) -> None:

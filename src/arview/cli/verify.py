@@ -99,6 +99,47 @@ def verify(
     click.get_current_context().exit(exit_code_of(test.verdict.value))
 
 
+@main.command(
+    "compare",
+    short_help="Compare an inspection with a list measured otherwise, by E_n.",
+    epilog="""\b
+Examples:
+  arview compare cmm.csv out/inspection.json
+  arview compare cmm.csv out/ -o compare.json --all
+  arview compare cmm.csv
+
+\b
+LIST is a CSV of another measurement, such as a coordinate measuring machine's: columns name and x, y, z
+(the stated point of the component) or dx, dy, dz (measured minus nominal), in the datum frame, and
+optionally U (k = 2), in mm; separated by ; or , or tabs, with decimal point or comma. INSPECTION is an
+inspection.json or the folder it is in; default: inspection.json in the folder of LIST. The E_n number
+(ISO/IEC 17043) of a component is the difference of both over their joint U: up to 1, they agree.""",
+    exit_codes={
+        ExitCode.DONE: "every E_n is at most 1",
+        ExitCode.FAIL: "an E_n is above 1",
+    },
+)
+@click.argument("listed", metavar="LIST")
+@click.argument("inspection", metavar="[INSPECTION]", required=False)
+@click.option("-o", "--output", metavar="JSON", help="Write all differences and E_n numbers.")
+@click.option("--part", "part_path", metavar="PART", help="Part or CAD file, for positions of an old inspection.")
+@UNIT
+@click.option("--all", "shows_all", is_flag=True, help=f"Print every component, not only the {_SHOWN} largest E_n.")
+def compare(
+    listed: str, inspection: str | None, output: str | None, part_path: str | None, unit: str | None, shows_all: bool
+) -> None:
+    """Compare LIST with an inspection, component by component."""
+    from arview.cad import load_part
+
+    source = inspection or str(Path(listed).parent)
+    target = None if output is None else output_path(output, [source, listed])
+    if not Path(listed).is_file():
+        raise InputError(f"{listed}: no such file; give the CSV list of the other measurement")
+    if inspection is None and not (Path(source) / "inspection.json").is_file():
+        raise InputError(f"{source}: holds no inspection.json; name the inspection after the list")
+    _compare(source, listed, target, None if part_path is None else load_part(part_path, unit).model, shows_all)
+
+
 def _is_list(measured: str, known: str) -> bool:
     """Whether KNOWN lists components and MEASURED is an inspection to compare them with."""
     from arview.acceptance.position_list import is_position_list

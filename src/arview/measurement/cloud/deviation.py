@@ -10,7 +10,7 @@ import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,9 @@ from arview.cad.model import Component, Model
 from arview.cad.part import Part
 from arview.errors import InputError
 from arview.geometry import Array, apply, invert, rigid
+from arview.measurement.cloud.classical_icp import ClassicalIcpOptions, icp_move
 from arview.measurement.cloud.mesh_surface import MeshSurface
+from arview.measurement.cloud.placing import check_belongs
 from arview.measurement.cloud.points import CloudPoints, prepare_cloud
 from arview.measurement.cloud.registration import (
     Registration,
@@ -55,7 +57,10 @@ class CloudDeviationOptions:
         min_points: of a component.
         scanned_mm: without photos, surface farther from every point of the cloud was not scanned, and is not expected.
         rival_cost: a second minimum is reported when its cost is less than this many times the best one's.
+        rival_mm: minima nearer to each other are one, and not reported.
         registration: options of the solver.
+        way: ``icp`` replaces each position by that of the classical ICP, for comparison.
+        icp: its options.
     """
 
     band_mm: float = 5.0
@@ -71,6 +76,9 @@ class CloudDeviationOptions:
     min_points: int = 60
     rival_cost: float = 1.5
     scanned_mm: float = 6.0
+    rival_mm: float = 0.2
+    way: Literal["surface", "icp"] = "surface"
+    icp: ClassicalIcpOptions = field(default_factory=ClassicalIcpOptions)
     registration: RegistrationOptions = field(
         default_factory=lambda: RegistrationOptions(min_width_mm=0.1, threshold_mm=1e-3, threshold_deg=1e-3)
     )
@@ -159,37 +167,12 @@ def measure_components_in_cloud(
             return _measure(moved, points, found.nominal_from_measured, o)
 
         second = list(threads.map(again, range(len(components))))
+        if o.way == "icp":
+            second = [_by_icp(found, c, points, o) for found, c in zip(second, components, strict=True)]
         return list(
             threads.map(
                 lambda i: _with_swapped_name(second[i], components[i], components, points, o), range(len(second))
             )
-        )
-
-
-def check_belongs(points: CloudPoints, model: Model, band_mm: float) -> None:
-    """Raise InputError when few points are near the CAD, or many more when the cloud is mirrored."""
-    vertices, faces, _ = model.mesh
-    surface = MeshSurface(vertices, faces)
-    few = points.points[:: max(1, len(points) // 6000)]
-    near = 0.2 * band_mm
-
-    def share(trial: Array) -> float:
-        distance = surface.closest(trial, near).faces
-        return float(np.mean(distance >= 0))
-
-    as_is = share(few)
-    center, mirrored = model.center_in_model, 0.0
-    for flip in (np.array([-1.0, 1.0, 1.0]), np.array([1.0, -1.0, 1.0])):
-        mirrored = max(mirrored, share((few - center) * flip + center))
-    if mirrored > as_is + 0.03 and 1.0 - mirrored < 0.5 * (1.0 - as_is):
-        raise InputError(
-            f"cloud: {100 * mirrored:.0f} % of it lies on the CAD when mirrored, {100 * as_is:.0f} % as it is: the "
-            "cloud or the CAD is left-handed"
-        )
-    if as_is < 0.3:
-        raise InputError(
-            f"cloud: only {100 * as_is:.0f} % of it is within {near:g} mm of the CAD: it is of another part, has a "
-            "wrong scale, or is not aligned"
         )
 
 
@@ -332,6 +315,28 @@ def _measure(
     return _move(c, fit, support, o)
 
 
+def _by_icp(
+    found: Move | NotMeasured, c: CloudComponent, cloud: CloudPoints, o: CloudDeviationOptions
+) -> Move | NotMeasured:
+    """The same component placed by the classical ICP."""
+    if not isinstance(found, Move):
+        return found
+    own = _crop(c, cloud, o)[1]
+    samples, faces = c.surface.sample(max(0.5 * o.icp.grid_mm, 0.2))
+    usable = c.usable_faces[faces]
+    try:
+        return icp_move(
+            found,
+            own.points,
+            samples[usable],
+            c.surface.face_normals[faces[usable]],
+            c.component.bounds_in_model,
+            o.icp,
+        )
+    except InputError as error:
+        return NotMeasured(c.component.name, "cloud", str(error).removeprefix("registration: "))
+
+
 def _crop(c: CloudComponent, cloud: CloudPoints, o: CloudDeviationOptions) -> tuple[CloudPoints, CloudPoints]:
     """Points around the component, and those of them that may belong to it."""
     low, high = c.component.bounds_in_model[0] - o.band_mm, c.component.bounds_in_model[1] + o.band_mm
@@ -430,10 +435,10 @@ def _move(c: CloudComponent, fit: Registration, support: float, o: CloudDeviatio
     if not fit.converged:
         notes.append(f"did not converge in {fit.iterations} iterations")
     if fit.runner_up is not None and fit.runner_up_cost is not None and fit.runner_up_cost < o.rival_cost:
-        other = twist_about(c.center, invert(fit.runner_up))[3:]
-        notes.append(
-            f"fits nearly as well {np.linalg.norm(other - twist[3:]):.2f} mm away (cost × {fit.runner_up_cost:.2f})"
-        )
+        # Minima that differ along what is undetermined only, such as the turn of a round post, are one.
+        other = determined @ (twist_about(c.center, invert(fit.runner_up)) * scales) - twist * scales
+        if np.linalg.norm(other) > o.rival_mm:
+            notes.append(f"fits nearly as well {np.linalg.norm(other):.2f} mm away (cost × {fit.runner_up_cost:.2f})")
     if np.linalg.norm(twist[3:]) > 0.9 * o.band_mm:
         notes.append(f"at the limit of the searched band of {o.band_mm:g} mm")
     if support < 0.6:

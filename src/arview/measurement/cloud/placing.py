@@ -129,3 +129,30 @@ def moved_to_model(cloud: DenseCloud, found: Similarity) -> DenseCloud:
         cloud, points=apply(found.model_from_scan, cloud.points * found.scale if found.scale != 1.0 else cloud.points),
         normals=cloud.normals @ rotation.T, sigma=np.asarray(cloud.sigma * found.scale, dtype=np.float32),
     )  # fmt: skip
+
+
+def check_belongs(points: CloudPoints, model: Model, band_mm: float) -> None:
+    """Raise InputError when few points are near the CAD, or many more when the cloud is mirrored."""
+    vertices, faces, _ = model.mesh
+    surface = MeshSurface(vertices, faces)
+    few = points.points[:: max(1, len(points) // 6000)]
+    near = 0.2 * band_mm
+
+    def share(trial: Array) -> float:
+        distance = surface.closest(trial, near).faces
+        return float(np.mean(distance >= 0))
+
+    as_is = share(few)
+    center, mirrored = model.center_in_model, 0.0
+    for flip in (np.array([-1.0, 1.0, 1.0]), np.array([1.0, -1.0, 1.0])):
+        mirrored = max(mirrored, share((few - center) * flip + center))
+    if mirrored > as_is + 0.03 and 1.0 - mirrored < 0.5 * (1.0 - as_is):
+        raise InputError(
+            f"cloud: {100 * mirrored:.0f} % of it lies on the CAD when mirrored, {100 * as_is:.0f} % as it is: the "
+            "cloud or the CAD is left-handed"
+        )
+    if as_is < 0.3:
+        raise InputError(
+            f"cloud: only {100 * as_is:.0f} % of it is within {near:g} mm of the CAD: it is of another part, has a "
+            "wrong scale, or is not aligned"
+        )

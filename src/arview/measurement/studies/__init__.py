@@ -1,18 +1,28 @@
-"""Studies of the registration with simulated posts; each writes its results as CSV and a picture."""
+"""Studies of the registration with simulated posts and with clouds; each writes its results as CSV and a picture."""
 
+from arview.measurement.studies.bias_map import bias_study
+from arview.measurement.studies.cloud_registration import cloud_registration_study
 from arview.measurement.studies.common import Study, write_study
 from arview.measurement.studies.density import density_study
 from arview.measurement.studies.displacement import displacement_study
+from arview.measurement.studies.minima import minima_study
 from arview.measurement.studies.noise import noise_study
+from arview.measurement.studies.registration import registration_study
 from arview.measurement.studies.rice import rice_study
+from arview.measurement.studies.sampling import sampling_study
 from arview.measurement.studies.threshold import threshold_study
 
 __all__ = [
     "Study",
+    "bias_study",
+    "cloud_registration_study",
     "density_study",
     "displacement_study",
+    "minima_study",
     "noise_study",
+    "registration_study",
     "rice_study",
+    "sampling_study",
     "threshold_study",
     "write_study",
 ]
