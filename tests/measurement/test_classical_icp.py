@@ -15,7 +15,8 @@ from arview.measurement.studies.minima import posts
 from arview.measurement.studies.sampling import by_information
 from arview.measurement.studies.sampling import scan as scan_of_post
 from arview.measurement.types import Move
-from helpers.plate_scene import as_built, nominal, plate_part
+from helpers.plate_scene import as_built, nominal
+from helpers.plate_scene import part as plate_part
 
 
 def displaced(noise_mm: float) -> tuple[Array, Array, Array, Array, Array]:

@@ -241,6 +241,29 @@ def bias(cloud: str, part: str, truth: str | None, cell: float, output: str, qui
     _write(lambda: bias_study(cloud, part, truth, cell, quick, seed), output)
 
 
+@study.command(
+    short_help="A quarter of a part beside ten times as many foreign points.",
+    epilog="""\b
+Examples:
+  arview study finding --part part.toml --quick
+  arview study finding --part samples/plate/part.toml --runs 12
+
+\b
+Every cloud shows one end of the part, a quarter of its surface, among boxes, tubes and balls; half as
+many clouds hold these alone. The search of `arview measure --cloud` is compared with FPFH and RANSAC.""",
+)
+@click.option("--part", required=True, metavar="PART", help="Part or CAD file.")
+@click.option("--runs", type=click.IntRange(min=1), metavar="N", help="Clouds with the part.  [default: 6]")
+@OUTPUT
+@QUICK
+@SEED
+def finding(part: str, runs: int | None, output: str, quick: bool, seed: int) -> None:
+    """How often a part is found, and how often refused where it is not."""
+    from arview.measurement.studies import finding_study
+
+    _write(lambda: finding_study(part, quick, seed, runs), output)
+
+
 def _write(make: Callable[[], Study], output: str) -> None:
     from arview.measurement.studies import write_study
 

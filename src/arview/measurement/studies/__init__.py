@@ -5,6 +5,7 @@ from arview.measurement.studies.cloud_registration import cloud_registration_stu
 from arview.measurement.studies.common import Study, write_study
 from arview.measurement.studies.density import density_study
 from arview.measurement.studies.displacement import displacement_study
+from arview.measurement.studies.finding import finding_study
 from arview.measurement.studies.minima import minima_study
 from arview.measurement.studies.noise import noise_study
 from arview.measurement.studies.registration import registration_study
@@ -18,6 +19,7 @@ __all__ = [
     "cloud_registration_study",
     "density_study",
     "displacement_study",
+    "finding_study",
     "minima_study",
     "noise_study",
     "registration_study",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from arview.cad.part import Part
 from arview.errors import InputError
@@ -129,7 +130,7 @@ def _cells(
     return rows, means[kept], sigmas[kept], counts[kept].astype(np.float64)
 
 
-def _map(places: Array, means: Array, facing: Array, cell_mm: float) -> Picture:
+def _map(places: Array, means: Array, facing: NDArray[np.bool_], cell_mm: float) -> Picture:
     """(600,960,3) the cells that face upward, seen from above: blue below the surface, red above it."""
     image = np.full((600, 960, 3), 255, dtype=np.uint8)
     limit = max(float(np.quantile(np.abs(means), 0.95)), 1e-4)

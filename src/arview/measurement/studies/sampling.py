@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from arview.geometry import Array, apply
 from arview.measurement.cloud.mesh_surface import MeshSurface
@@ -81,7 +82,7 @@ def scan(surface: MeshSurface, count: int, rng: np.random.Generator) -> tuple[Ar
     return points[chosen], normals[chosen]
 
 
-def by_information(points: Array, normals: Array, count: int, rng: np.random.Generator) -> Array:
+def by_information(points: Array, normals: Array, count: int, rng: np.random.Generator) -> NDArray[np.int64]:
     """Indices (count,) of points, chosen at random by their leverage (Ma, Mahoney & Yu, JMLR 2015).
 
     The leverage is a point's share of what is known about the six motions; a few points that alone determine one of
