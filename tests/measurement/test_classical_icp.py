@@ -10,7 +10,9 @@ from arview.errors import InputError
 from arview.geometry import Array, apply
 from arview.measurement.cloud.classical_icp import ClassicalIcpOptions, classical_icp
 from arview.measurement.cloud.deviation import CloudDeviationOptions, measure_components_in_cloud
+from arview.measurement.cloud.mesh_surface import MeshSurface
 from arview.measurement.studies.common import post, sideways
+from arview.measurement.studies.finding import scene_of
 from arview.measurement.studies.minima import posts
 from arview.measurement.studies.sampling import by_information
 from arview.measurement.studies.sampling import scan as scan_of_post
@@ -86,3 +88,18 @@ def test_the_four_kinds_of_posts_are_closed() -> None:
         volume = float(np.sum(np.linalg.det(surface.triangles))) / 6.0
         assert 4000.0 < volume < np.pi * 64.0 * 40.0 + 1.0
         assert surface.triangles[..., 2].max() == pytest.approx(40.0)
+
+
+def test_clouds_of_the_finding_study() -> None:
+    """A quarter of the surface, ten times as many other points, none of them in the part's box."""
+    scene = scene_of(nominal(), True, np.random.default_rng(4))
+    assert scene.model_from_scan is not None
+    surface = MeshSurface(*nominal().mesh[:2])
+    moved = apply(scene.model_from_scan, scene.points)
+    on = np.abs(surface.closest(moved).distances) < 1.0
+    assert 0.08 < np.mean(on) < 0.1  # one point in eleven
+    normals = scene.normals @ scene.model_from_scan[:3, :3].T
+    cosine = np.sum(normals[on] * surface.closest(moved[on]).normals, axis=1)
+    assert np.mean(cosine > 0.9) > 0.95
+    other = scene_of(nominal(), False, np.random.default_rng(4))
+    assert other.model_from_scan is None and len(other.points) < len(scene.points)
