@@ -164,6 +164,7 @@ def _by_features(scene: Scene, model: Model) -> tuple[Array, float]:
         cloud.normalize_normals()
         return cloud, methods.compute_fpfh_feature(cloud, o3d.geometry.KDTreeSearchParamHybrid(5.0 * cell, 100))
 
+    o3d.utility.set_verbosity_level(o3d.utility.VerbosityLevel.Error)
     o3d.utility.random.seed(0)
     part, of_part = prepared(samples, surface.face_normals[of_face])
     cloud, of_cloud = prepared(scene.points, scene.normals)
