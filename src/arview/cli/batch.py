@@ -38,7 +38,8 @@ A file JOBS.toml:
   serial = "PL-0418"
   photos = "s3://plates/PL-0418"
   video = "films/PL-0418.mp4"
-  # camera, video_camera, scale_file, unit, guard, max_frames, seed, threads, device, makes_pdf
+  # camera, video_camera, scale_file, masks, sparse, unit, guard, max_frames, seed, threads, device,
+  # makes_pdf, compares_halves
 
 \b
 Paths are relative to JOBS.toml, or URLs that fsspec knows (s3, gs, abfs, sftp, http; some need a package,

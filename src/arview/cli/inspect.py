@@ -42,6 +42,10 @@ given the camera of the photos where the frames have the same aspect ratio. A ph
 differently: give --video-camera then.
 
 \b
+With 16 photos or more, two interleaved halves of them are adjusted and measured apart, and the report
+compares them with their U. Where they differ by more, U is enlarged. --no-repeatability leaves this out.
+
+\b
 A video or PDF that cannot be made is a warning: the verdict stands without it.""",
     exit_codes={
         ExitCode.DONE: "pass: every component passes or has no tolerance, and there is no foreign object",
@@ -66,12 +70,16 @@ A video or PDF that cannot be made is a warning: the verdict stands without it."
 @click.option("--video-camera", metavar="CAMERA", help="The same for the video, if it was taken with another camera.")
 @click.option("--scale-file", metavar="FILE", help="TOML file of the boards, tags, scale bars and rig in view.")
 @click.option("--masks", metavar="FOLDER", help="Masks as IMAGE.png, black where a photo is not to be used.")
+@click.option("--sparse", metavar="FOLDER|FILE",
+              help="Camera poses made elsewhere: COLMAP model, Metashape XML or transforms.json.")  # fmt: skip
 @click.option("--tolerance", type=click.FloatRange(min=0, min_open=True), metavar="MM",
               help="Tolerance of components that have none in the part file.")  # fmt: skip
 @click.option("--guard", type=click.FloatRange(0, 3), default=1.0, show_default=True, metavar="G",
               help="Guard band as a multiple of U; 0 is simple acceptance.")  # fmt: skip
 @click.option("--max-frames", type=click.IntRange(min=3), default=60, show_default=True, metavar="N",
               help="Frames to measure of a video without photos.")  # fmt: skip
+@click.option("--no-repeatability", is_flag=True,
+              help="Do not measure two halves of the photos apart to compare them.")  # fmt: skip
 @click.option("--no-pdf", is_flag=True, help="Write the report as HTML only.")
 @click.option(
     "--seed", type=click.IntRange(min=0), default=0, show_default=True, help="The same seed gives the same cloud."
@@ -93,9 +101,11 @@ def inspect(
     video_camera: str | None,
     scale_file: str | None,
     masks: str | None,
+    sparse: str | None,
     tolerance: float | None,
     guard: float,
     max_frames: int,
+    no_repeatability: bool,
     no_pdf: bool,
     seed: int,
     threads: int,
@@ -108,8 +118,8 @@ def inspect(
     from arview.workflow.run import inspect_part
 
     job = InspectJob(
-        part_path, photos, video, serial, camera, video_camera, scale_file, unit, masks, tolerance, guard,
-        max_frames, seed, threads, device, not no_pdf,
+        part_path, photos, video, serial, camera, video_camera, scale_file, unit, masks, sparse, tolerance,
+        guard, max_frames, seed, threads, device, not no_pdf, not no_repeatability,
     )  # fmt: skip
     if store is not None:
         from arview.history import HistoryStore

@@ -10,8 +10,10 @@ from arview.inspection.details import (
     DistanceStatistics,
     FailedDatum,
     ForeignReport,
+    HalvesDifference,
     MethodAgreement,
     MethodResult,
+    Repeatability,
 )
 from arview.inspection.files import load_inspection, save_inspection
 from arview.inspection.record import (
@@ -37,11 +39,13 @@ __all__ = [
     "FailedDatum",
     "Finding",
     "ForeignReport",
+    "HalvesDifference",
     "Inspection",
     "MeasuredPresence",
     "MethodAgreement",
     "MethodResult",
     "Provenance",
+    "Repeatability",
     "Verdict",
     "load_inspection",
     "save_inspection",

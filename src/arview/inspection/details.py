@@ -259,6 +259,52 @@ class DistanceReport:
     files: tuple[str, ...] = ()
 
 
+@dataclass(frozen=True)
+class HalvesDifference:
+    """A component measured in two halves of the photos.
+
+    Attributes:
+        name: of the component.
+        difference_mm: length of the difference of its displacements, along the axes that both halves determine; None if
+            a half could not measure it.
+        joint_mm: length that 95 % of such differences do not exceed if the U of both halves are right.
+        e_n: ``difference_mm`` divided by ``joint_mm`` (E_n of ISO 13528); above 1 the halves contradict each other.
+        uncertainties_mm: U of the distance in each half, None where it was not measured.
+        reason: why it is not compared; empty if it is.
+    """
+
+    name: str
+    difference_mm: float | None = None
+    joint_mm: float | None = None
+    e_n: float | None = None
+    uncertainties_mm: tuple[float | None, ...] = (None, None)
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class Repeatability:
+    """The comparison of two interleaved halves of the photos, each adjusted and measured without the other.
+
+    Attributes:
+        photos: number of photos of each half.
+        components: the comparison of each component.
+        rms_mm: root mean square of the differences of the compared components; None without any.
+        cpu_s: processor time that it took.
+        reason: why the halves could not be compared; empty if they were.
+    """
+
+    photos: tuple[int, ...] = ()
+    components: tuple[HalvesDifference, ...] = ()
+    rms_mm: float | None = None
+    cpu_s: float | None = None
+    reason: str = ""
+
+    @property
+    def contradictions(self) -> tuple[HalvesDifference, ...]:
+        """The components at which the halves differ by more than their U allow."""
+        return tuple(one for one in self.components if one.e_n is not None and one.e_n > 1.0)
+
+
 def to_json(value: Any) -> Any:
     """Convert dataclasses to objects and tuples to lists; fields with their default value are omitted."""
     if is_dataclass(value) and not isinstance(value, type):

@@ -6,7 +6,15 @@ from datetime import datetime
 from typing import Any
 
 from arview.errors import InputError
-from arview.inspection.details import DatumSystem, Details, DistanceReport, ForeignReport, from_json, to_json
+from arview.inspection.details import (
+    DatumSystem,
+    Details,
+    DistanceReport,
+    ForeignReport,
+    Repeatability,
+    from_json,
+    to_json,
+)
 from arview.inspection.record import (
     SCHEMA_VERSION,
     ComponentDeviation,
@@ -24,6 +32,7 @@ def from_document(document: dict[str, Any]) -> Inspection:
     components = [component_from_entry(entry) for entry in document["components"]]
     source = document["provenance"]
     datums, distances = document.get("datum_system"), document.get("distance_map")
+    halves = document.get("repeatability")
     return Inspection(
         part=document["part"],
         serial=document["serial"],
@@ -45,6 +54,7 @@ def from_document(document: dict[str, Any]) -> Inspection:
         warnings=tuple(document.get("warnings", ())),
         foreign_objects=tuple(from_json(ForeignReport, one) for one in document.get("foreign_objects", ())),
         distance_map=None if distances is None else from_json(DistanceReport, distances),
+        repeatability=None if halves is None else from_json(Repeatability, halves),
     )
 
 
@@ -116,6 +126,8 @@ def to_document(inspection: Inspection) -> dict[str, Any]:
         document["foreign_objects"] = to_json(inspection.foreign_objects)
     if inspection.distance_map is not None:
         document["distance_map"] = to_json(inspection.distance_map)
+    if inspection.repeatability is not None:
+        document["repeatability"] = to_json(inspection.repeatability)
     return document
 
 

@@ -11,7 +11,7 @@ from enum import StrEnum
 
 from arview.cad.model import Model
 from arview.errors import InputError, MismatchError
-from arview.inspection.details import DatumSystem, Details, DistanceReport, ForeignReport
+from arview.inspection.details import DatumSystem, Details, DistanceReport, ForeignReport, Repeatability
 
 SCHEMA_VERSION = "1.2"
 READABLE_VERSIONS = ("1.0", "1.1", "1.2")
@@ -232,6 +232,7 @@ class Inspection:
         warnings: doubts about the inspection as a whole.
         foreign_objects: objects that are not in the CAD model, the largest first.
         distance_map: distances of the cloud to the CAD model, if there is a cloud.
+        repeatability: comparison of two halves of the photos; None if it was not made.
 
     Raises:
         InputError: a component appears twice, or ``created`` has no time zone.
@@ -247,6 +248,7 @@ class Inspection:
     warnings: tuple[str, ...] = ()
     foreign_objects: tuple[ForeignReport, ...] = ()
     distance_map: DistanceReport | None = None
+    repeatability: Repeatability | None = None
 
     def __post_init__(self) -> None:
         if self.created.utcoffset() != timedelta(0):

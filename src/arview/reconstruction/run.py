@@ -56,6 +56,13 @@ StageName = Literal["photos", "sparse", "scale", "dense"]
 STAGES: tuple[StageName, ...] = ("photos", "sparse", "scale", "dense")
 """Stages in their order."""
 
+_RESULTS: dict[StageName, tuple[str, ...]] = {
+    "photos": ("photos.json", "reconstruction.json"),
+    "sparse": ("sparse/model/*", "sparse/*.json", "sparse/covariance.npy", "sparse/points.ply"),
+    "scale": ("scale.json", "metric/*"),
+    "dense": ("cloud.ply",),
+}
+"""Files of each stage's results."""
 VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".mts", ".3gp"})
 """Files with these suffixes are videos."""
 
@@ -148,8 +155,8 @@ class _ReconstructionRun:
         self.stages = Stages(folder)
         self.seconds: dict[str, float] = {}
         if options.starts_over:
-            for stage in ("frames", *STAGES):
-                self.stages.restart(stage)
+            self.stages.restart("frames")
+            self._restart("photos")
 
     def all(self, source: str | Path, camera: str | None) -> Reconstruction:
         """Run the stages in their order."""
@@ -176,6 +183,17 @@ class _ReconstructionRun:
         result = Reconstruction(self.folder, intake, sparse, scale, cloud, cover, quality, self.seconds)
         write_json(self.folder / "reconstruction.json", summary(result))
         return result
+
+    def _restart(self, stage: StageName) -> None:
+        """Remove the results of a stage and of those after it, which this run may not reach.
+
+        Otherwise an old cloud would stand beside a new scale.
+        """
+        for name in STAGES[STAGES.index(stage) :]:
+            self.stages.restart(name)
+            for pattern in _RESULTS[name]:
+                for old in self.folder.glob(pattern):
+                    old.unlink(missing_ok=True)
 
     def _record_time(self, name: str, began: float) -> None:
         self.seconds[name] = round(time.perf_counter() - began, 2)
@@ -212,7 +230,7 @@ class _ReconstructionRun:
         folder = self.folder / "sparse"
         if self.stages.is_finished("sparse", key):
             return _read_sparse(folder, photos)
-        self.stages.restart("sparse")
+        self._restart("sparse")
         sparse = self._placed(photos, folder)
         _write_sparse(folder, sparse)
         self.stages.finish("sparse", key)
@@ -232,7 +250,7 @@ class _ReconstructionRun:
         path = self.folder / "scale.json"
         if self.stages.is_finished("scale", key):
             return ScaleResult.from_provenance(json.loads(path.read_text(encoding="utf-8")))
-        self.stages.restart("scale")
+        self._restart("scale")
         scale = find_scale(sparse, self.part, self.options.sources, self.options.scale, progress=self.tell)
         # The scale's file carries all doubts about the reconstruction to the measurement and its report.
         apart = groups_warning([photo.name for photo in photos], sparse.groups)
@@ -264,7 +282,7 @@ class _ReconstructionRun:
         path = self.folder / "cloud.ply"
         if self.stages.is_finished("dense", key):
             return read_ply(path)
-        self.stages.restart("dense")
+        self._restart("dense")
         cloud = reconstruct_dense(sparse, self.options.dense, cad, self.folder / "dense", self.tell)
         write_ply(cloud, path)
         self.stages.finish("dense", key)

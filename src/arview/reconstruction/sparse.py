@@ -375,7 +375,7 @@ def _triangulate_and_adjust(
         model, str(path), str(folder), str(_emptied(folder / "triangulated")), True, triangulation
     )
     tell("adjusting", 1, 3)
-    refines_centre = _adjust_with_centre(model, options, threads)
+    refines_centre = adjust_with_centre(model, options, threads)
     tell("adjusting", 2, 3)
     pycolmap.ObservationManager(model).filter_all_points3D(options.max_error_px, options.min_angle_deg)
     adjuster = adjust(model, threads, refines_centre=refines_centre)
@@ -383,7 +383,7 @@ def _triangulate_and_adjust(
     return model, adjuster
 
 
-def _adjust_with_centre(model: Any, options: SparseOptions, threads: int) -> bool:
+def adjust_with_centre(model: Any, options: SparseOptions, threads: int) -> bool:
     """Adjust everything including the principal points, and restore those that moved less than their uncertainty.
 
     Returns whether the principal points are to be refined from here on. Correlated errors of features move a principal

@@ -36,6 +36,7 @@ from arview.report.formatting import (
     verdict_word,
     zone_text,
 )
+from arview.report.halves import repeatability_context
 from arview.report.pictures import Crop, CropOptions, Gallery, RgbImage, make_gallery, overview
 from arview.report.scene import SceneOptions, make_scene, scene_json
 from arview.version import __version__
@@ -92,6 +93,7 @@ def build_context(evidence: ReportEvidence, options: ReportOptions, progress: Pr
     }
     context |= _components(evidence) | _findings(evidence, gallery, options)
     context |= _distance_map(evidence, options) | _budget(inspection) | _datums(inspection)
+    context |= repeatability_context(inspection)
     progress("photos", 0, 1)
     context |= _photos(evidence)
     if model is not None:

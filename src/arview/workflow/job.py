@@ -29,6 +29,7 @@ class InspectJob:
     scale_file: str | None = None
     unit: str | None = None
     masks: str | None = None  # folder of masks of the photos, black where a photo is not to be used
+    sparse: str | None = None  # camera poses made elsewhere: COLMAP model, Metashape XML or transforms.json
     tolerance_mm: float | None = None  # tolerance of components without one in the part file
     guard: float = 1.0  # fraction of U by which the tolerance is reduced; 1: ISO 14253-1
     max_frames: int = 60  # frames of a video that are used as photos
@@ -36,6 +37,7 @@ class InspectJob:
     threads: int = 0  # threads of the reconstruction; 0: all cores
     device: str = "auto"  # device of dense matching
     makes_pdf: bool = True
+    compares_halves: bool = True  # measure two halves of the photos apart and compare them
 
     @property
     def photo_source(self) -> str:

@@ -18,7 +18,8 @@ out = "results"                # contains a folder for each job
 
 [defaults]                     # default values: any field of a job
 part = "part.toml"
-# tolerance_mm, guard, camera, video_camera, scale_file, unit, max_frames, seed, device, makes_pdf
+# tolerance_mm, guard, camera, video_camera, scale_file, masks, sparse, unit, max_frames, seed, device, makes_pdf,
+# compares_halves
 
 [[job]]
 serial = "PL-0417"             # also the name of its folder, unless a name is given
@@ -32,8 +33,11 @@ video = "films/PL-0418.mp4"
 """
 """A complete jobs file, shown by `arview batch --help`."""
 
-LOCATION_FIELDS = ("part", "photos", "video", "camera", "video_camera", "scale_file")
-_KINDS = {"tolerance_mm": float, "guard": float, "max_frames": int, "seed": int, "threads": int, "makes_pdf": bool}
+LOCATION_FIELDS = ("part", "photos", "video", "camera", "video_camera", "scale_file", "masks", "sparse")
+_KINDS = {
+    "tolerance_mm": float, "guard": float, "max_frames": int, "seed": int, "threads": int, "makes_pdf": bool,
+    "compares_halves": bool,
+}  # fmt: skip
 _NAME = re.compile(r"[\w][\w.+-]*")
 
 

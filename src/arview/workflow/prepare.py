@@ -12,6 +12,7 @@ from arview.errors import InputError
 from arview.measurement.options import MeasureOptions
 from arview.measurement.uncertainty.decision import DecisionOptions
 from arview.reconstruction.dense import DenseOptions
+from arview.reconstruction.given_poses import read_poses
 from arview.reconstruction.intake import VideoIntakeOptions
 from arview.reconstruction.intake.reading import photo_paths
 from arview.reconstruction.run import ReconstructOptions
@@ -58,6 +59,8 @@ def prepare(job: InspectJob, folder: Path) -> Prepared:
         raise InputError(f"part {part.name!r}: no component has the role 'inspect'")
     if job.masks and not Path(job.masks).is_dir():
         raise InputError(f"{job.masks}: no such folder; give the folder of the masks")
+    if job.sparse:
+        read_poses(job.sparse)
     _check_cameras(job)
     threads, seed = job.threads, job.seed
     reconstruct = ReconstructOptions(
@@ -65,6 +68,7 @@ def prepare(job: InspectJob, folder: Path) -> Prepared:
         sparse=SparseOptions(seed=seed, threads=threads),
         sources=load_scale_file(job.scale_file) if job.scale_file else ScaleSources(),
         dense=DenseOptions(seed=seed, threads=threads, device=job.device),
+        poses=Path(job.sparse) if job.sparse else None,
         masks=Path(job.masks) if job.masks else None,
     )
     measure = MeasureOptions(
@@ -94,10 +98,12 @@ def measurement_key(prepared: Prepared) -> str:
     source = Path(job.photo_source)
     photos = [source] if source.is_file() else photo_paths(job.photo_source)[0]
     masks = sorted(Path(job.masks).rglob("*.png")) if job.masks else []
+    poses = [(one.name, one.cam_from_scan.tolist()) for one in read_poses(job.sparse)] if job.sparse else []
     return key_of(
-        content_key(photos), content_key(masks), _content(job.camera), part.model.source_hash, part.name, part.settings,
+        content_key(photos), content_key(masks), poses, job.compares_halves, _content(job.camera),
+        part.model.source_hash, part.name, part.settings,
         part.datums, part.serial, part.effective_view_range, replace(options, maps_folder=None),
-        replace(prepared.reconstruct, masks=None, sparse=replace(prepared.reconstruct.sparse, threads=0),
+        replace(prepared.reconstruct, masks=None, poses=None, sparse=replace(prepared.reconstruct.sparse, threads=0),
                 dense=replace(prepared.reconstruct.dense, threads=0)), __version__,
     )  # fmt: skip
 

@@ -26,6 +26,7 @@ STEPS: tuple[tuple[str, float], ...] = (
     ("datums", 2.0),
     ("uncertainty", 1.0),
     ("distance map", 3.0),
+    ("halves", 12.0),
     ("pictures", 4.0),
     ("charts", 2.0),
     ("3D view", 2.0),

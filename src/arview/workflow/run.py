@@ -27,6 +27,7 @@ from arview.inspection.summary import overall_verdict, verdict_sentence
 from arview.reconstruction.run import Reconstruction, reconstruct
 from arview.version import __version__
 from arview.workflow.film import camera_of_video, make_film
+from arview.workflow.halves import with_halves
 from arview.workflow.job import InspectJob
 from arview.workflow.lock import exclusive_access
 from arview.workflow.prepare import Prepared, measurement_key, prepare
@@ -163,7 +164,10 @@ class _InspectionRun:
             from arview.measurement.run import measure
 
             with _measuring():
-                inspection = measure(read_folder(self.folder), part, self.prepared.measure, progress=self.progress)
+                found = read_folder(self.folder)
+                inspection = measure(found, part, self.prepared.measure, progress=self.progress)
+            if self.prepared.job.compares_halves:
+                inspection = with_halves(inspection, found, self.folder, self.prepared, self.progress)
             save_inspection(inspection, path)
             return ""
 

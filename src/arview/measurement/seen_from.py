@@ -1,0 +1,59 @@
+"""From how many photos and directions a component was seen, and what follows for its measurement."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+from arview.cad.model import Model
+from arview.inspection import ComponentDeviation
+from arview.reconstruction.coverage import ComponentCoverage, CoverageOptions, coverage
+from arview.reconstruction.types import SparseModel
+
+
+@dataclass(frozen=True)
+class SeenFrom:
+    """Photos and directions from which each component is seen, and the options by which they are few."""
+
+    components: Mapping[str, ComponentCoverage]
+    options: CoverageOptions
+
+
+def seen_from(sparse: SparseModel, model: Model, options: CoverageOptions | None = None) -> SeenFrom:
+    """What the photos show of each component; nothing without photos.
+
+    Args:
+        sparse: the photos, in the frame of the model.
+        model: the nominal CAD.
+        options: see `CoverageOptions`.
+    """
+    options = options or CoverageOptions()
+    if not sparse.photos:
+        return SeenFrom({}, options)
+    found = coverage(model, [(photo.camera, photo.cam_from_scan) for photo in sparse.photos], options)
+    return SeenFrom({one.name: one for one in found.components}, options)
+
+
+def with_seen_from(record: ComponentDeviation, seen: SeenFrom) -> ComponentDeviation:
+    """The record with the number of photos that show the component, and why its U is wide if they are too few."""
+    covered = seen.components.get(record.name)
+    if covered is None or record.details is None:
+        return record
+    note = _few(covered, seen.options, record.distance_mm is not None)
+    notes = (*record.details.notes, *((note,) if note else ()))
+    return replace(record, details=replace(record.details, photos=len(covered.photos), notes=notes))
+
+
+def _few(covered: ComponentCoverage, options: CoverageOptions, is_measured: bool) -> str:
+    """Why the photos of a component are too few; empty if they are not."""
+    photos = len(covered.photos)
+    if photos == 0:
+        return "no photo shows enough of it: other components hide it, or it is outside the pictures"
+    if photos >= options.photos_wanted and covered.directions >= options.directions_wanted:
+        return ""
+    places = f"{covered.directions} direction{'s' * (covered.directions != 1)}"
+    text = f"only {photos} photo{'s' * (photos != 1)} from {places} show{'s' * (photos == 1)} it"
+    if photos > 1:
+        text += f", at most {covered.spread_deg:.0f}° apart"
+    wide = ", so its U is wide" if is_measured else ""
+    return f"{text}{wide}; take more from other sides"

@@ -1,0 +1,93 @@
+"""Two interleaved halves of the photos, each adjusted alone, for a measurement that is repeated.
+
+Photos of a real part have no truth. Two halves of a set that are adjusted apart share neither a photo nor an error of
+its pose, and their lenses are calibrated apart too. They share the features, the matches (an observation of a point is
+that of the whole set), the start of the adjustment and the rough frame.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from arview.errors import CannotMeasureError
+from arview.geometry import rigid
+from arview.reconstruction.colmap import import_pycolmap, read_reconstruction, sparse_model_of
+from arview.reconstruction.covariance import pose_covariance
+from arview.reconstruction.groups import linked_groups
+from arview.reconstruction.sparse import SparseOptions, adjust, adjust_with_centre
+from arview.reconstruction.types import Photo, PosedPhoto, SparseModel
+
+
+@dataclass(frozen=True)
+class HalvesOptions:
+    """When a set is halved, and how the halves are adjusted."""
+
+    min_photos: int = 16  # placed photos; fewer than eight in a half leave gaps that the whole set does not have
+    sparse: SparseOptions = field(default_factory=SparseOptions)
+
+
+def halves_of(folder: Path, sparse: SparseModel, options: HalvesOptions | None = None) -> tuple[SparseModel, ...]:
+    """The even and the odd photos of a model, in the order in which they were taken, in frame and unit of ``sparse``.
+
+    Args:
+        folder: of the whole model in COLMAP's format, in any unit.
+        sparse: the whole model.
+        options: see `HalvesOptions`.
+
+    Raises:
+        CannotMeasureError: there are too few photos, or those of a half are not placed without the others.
+    """
+    options = options or HalvesOptions()
+    if len(sparse.photos) < options.min_photos:
+        raise CannotMeasureError(f"{len(sparse.photos)} photos are too few to be halved ({options.min_photos} needed)")
+    return tuple(_half(folder, sparse, sparse.photos[first::2], options.sparse) for first in (0, 1))
+
+
+def _half(folder: Path, whole: SparseModel, photos: Sequence[PosedPhoto], options: SparseOptions) -> SparseModel:
+    """The model of some of the photos, adjusted alone."""
+    pycolmap = import_pycolmap()
+    model = read_reconstruction(folder)
+    names = {photo.name for photo in photos}
+    for image_id in list(model.reg_image_ids()):
+        if model.images[image_id].name not in names:
+            model.deregister_frame(model.images[image_id].frame_id)
+    model.tear_down()
+    listed = [_listed(photo) for photo in photos]
+    threads = options.threads or os.cpu_count() or 1
+    refines_centre = adjust_with_centre(model, options, threads)
+    pycolmap.ObservationManager(model).filter_all_points3D(options.max_error_px, options.min_angle_deg)
+    if len(model.points3D) < options.groups.min_shared_points:
+        raise CannotMeasureError(f"half of the photos ({photos[0].name}, {photos[1].name}, …) share too few points")
+    adjuster = adjust(model, threads, refines_centre=refines_centre)
+    sparse = sparse_model_of(model, listed)
+    sparse = replace(sparse, pose_covariance=pose_covariance(sparse, model, adjuster))
+    if len(linked_groups(sparse, options.groups)) > 1:
+        raise CannotMeasureError(
+            f"half of the photos ({photos[0].name}, {photos[1].name}, …) are not placed without the other half"
+        )
+    return _onto(sparse, whole)
+
+
+def _listed(photo: PosedPhoto) -> Photo:
+    """A placed photo as a photo of intake; its camera is that of the model."""
+    return Photo(
+        photo.name, photo.path, photo.camera.width, photo.camera.height, "", photo.camera, mask=photo.mask
+    )  # fmt: skip
+
+
+def _onto(sparse: SparseModel, whole: SparseModel) -> SparseModel:
+    """The model in the frame and unit of another one, by the centres of the photos of both (Umeyama 1991)."""
+    target = {photo.name: photo.centre_in_scan for photo in whole.photos}
+    ours = np.array([photo.centre_in_scan for photo in sparse.photos])
+    theirs = np.array([target[photo.name] for photo in sparse.photos])
+    middle, their_middle = ours.mean(axis=0), theirs.mean(axis=0)
+    u, _, vt = np.linalg.svd((theirs - their_middle).T @ (ours - middle))
+    rotation = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+    turned = (ours - middle) @ rotation.T
+    scale = float(np.sum(turned * (theirs - their_middle)) / np.sum(turned**2))
+    return sparse.transformed(scale, rigid(rotation, their_middle - scale * rotation @ middle))
