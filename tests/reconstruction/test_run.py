@@ -155,6 +155,26 @@ def test_finished_stages_are_read_not_repeated(
         reconstruct(folder / "photos", folder / "out", part, options=other)
 
 
+def test_results_after_a_repeated_stage_are_removed(tmp_path: Path) -> None:
+    """A cloud of an earlier run never stands beside a new scale, whether or not this run reaches the cloud."""
+    files = ("photos.json", "sparse/points.ply", "sparse/covariance.npy", "scale.json", "metric/a.bin", "cloud.ply")
+
+    def left(begin: run.StageName | None, options: ReconstructOptions) -> list[str]:
+        for name in files:
+            (tmp_path / name).parent.mkdir(exist_ok=True)
+            (tmp_path / name).write_text("old")
+        one = run._ReconstructionRun(tmp_path, None, options, lambda what, done, total: None)
+        if begin:
+            one._restart(begin)
+        return [name for name in files if (tmp_path / name).exists()]
+
+    assert left(None, ReconstructOptions()) == list(files)
+    assert left("dense", ReconstructOptions()) == list(files[:5])
+    assert left("scale", ReconstructOptions()) == list(files[:3])
+    assert left("sparse", ReconstructOptions()) == ["photos.json"]
+    assert left(None, ReconstructOptions(starts_over=True)) == []
+
+
 # --- bad input -------------------------------------------------------------------------------------------
 
 

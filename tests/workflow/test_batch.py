@@ -145,6 +145,15 @@ def test_the_example_is_a_file_of_jobs(tmp_path: Path) -> None:
     assert second.job.video == str(tmp_path / "films" / "PL-0418.mp4") and second.job.serial == "PL-0418"
 
 
+def test_masks_and_poses_are_found_beside_the_file(tmp_path: Path) -> None:
+    path = tmp_path / "jobs.toml"
+    job = 'serial = "a"\npart = "p"\nphotos = "i"\nmasks = "m"\nsparse = "s3://poses/a"\ncompares_halves = false'
+    path.write_text(f'out = "o"\n[[job]]\n{job}')
+    found = load_jobs(path)[0].job
+    assert (found.masks, found.sparse) == (str(tmp_path / "m"), "s3://poses/a")
+    assert not found.compares_halves
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [
