@@ -139,6 +139,15 @@ def test_bad_files_are_refused_in_one_line(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow  # features of eight photos
+def test_a_quaternion_of_another_length_is_refused(tmp_path: Path) -> None:
+    folder = write_colmap_text(tmp_path / "model", POSES)
+    lines = (folder / "images.txt").read_text().splitlines()
+    words = lines[0].split()
+    (folder / "images.txt").write_text("\n".join([" ".join([*words[:2], "-10.6", *words[3:]]), *lines[1:]]) + "\n")
+    with pytest.raises(InputError, match="not a rotation"):
+        read_poses(folder)
+
+
 def test_photos_are_placed_by_given_poses(tmp_path: Path) -> None:
     """Poses with small errors, in a frame and unit of their own, give the true places after the adjustment."""
     poses = ring(12)[:8]

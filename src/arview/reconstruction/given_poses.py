@@ -138,7 +138,7 @@ def _read_colmap(folder: Path) -> tuple[GivenPose, ...]:
         if image.has_pose:
             matrix = np.asarray(image.cam_from_world().matrix())
             camera = _colmap_camera(model.cameras[image.camera_id], folder)
-            poses.append(GivenPose(image.name, camera, rigid(matrix[:, :3], matrix[:, 3])))
+            poses.append(GivenPose(image.name, camera, _rigid_of(matrix, folder)))
     return tuple(poses)
 
 

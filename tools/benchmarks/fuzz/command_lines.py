@@ -16,7 +16,7 @@ from seeds import make_seeds
 
 from arview.cli import main
 
-LEFT_OUT = {"live", "studio", "warmup", "batch"}
+LEFT_OUT = {"live", "studio", "study", "warmup", "batch"}
 """Commands that run for long or start other processes: their options are tested by name in tests/live and tests/cli."""
 TEXTS = (
     "",
@@ -60,9 +60,11 @@ def commands(group: click.Group, prefix: tuple[str, ...] = ()) -> list[tuple[tup
     """All commands with their names."""
     found: list[tuple[tuple[str, ...], click.Command]] = []
     for name, command in sorted(group.commands.items()):
+        if name in LEFT_OUT:
+            continue
         if isinstance(command, click.Group):
             found += commands(command, (*prefix, name))
-        elif name not in LEFT_OUT:
+        else:
             found.append(((*prefix, name), command))
     return found
 
