@@ -4,7 +4,8 @@
 |---|---|
 | ``GET /``, ``GET /static/...`` | the page |
 | ``GET /api/part`` | the part: text, components, datums, range, what can be undone (`StudioDocument.describe`) |
-| ``GET /api/findings`` | remarks of `arview check`, and the symmetries of the geometry |
+| ``GET /api/findings`` | remarks of `arview check` |
+| ``GET /api/symmetries`` | symmetries of the geometry |
 | ``POST /api/edit`` | an edit (`StudioDocument.edit`); answers with the part |
 | ``POST /api/undo``, ``/api/redo``, ``/api/save`` | answer with the part; save writes the part file |
 | ``GET /api/mesh?coarse=1`` | the mesh of the whole CAD (`arview.studio.mesh_data`) |
@@ -33,7 +34,7 @@ from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
-from starlette.types import ASGIApp
+from starlette.types import ASGIApp, Receive, Scope, Send
 
 from arview.errors import ArviewError
 from arview.live.options import LiveOptions
@@ -80,6 +81,7 @@ def make_app(document: StudioDocument, access: Access) -> ASGIApp:
         Route("/static/{name:path}", handlers.static),
         Route("/api/part", handlers.part),
         Route("/api/findings", handlers.findings),
+        Route("/api/symmetries", handlers.symmetries),
         Route("/api/edit", handlers.edit, methods=["POST"]),
         Route("/api/undo", handlers.undo, methods=["POST"]),
         Route("/api/redo", handlers.redo, methods=["POST"]),
@@ -96,7 +98,21 @@ def make_app(document: StudioDocument, access: Access) -> ASGIApp:
     ]
     app = Starlette(routes=routes, exception_handlers={ArviewError: _told, HTTPException: _told, **refusal_handlers()})
     limits = LiveOptions(source="none").requests
-    return Gate(app, access, RateLimit(limits.per_s, limits.burst))
+    return _Ended(Gate(app, access, RateLimit(limits.per_s, limits.burst)))
+
+
+class _Ended:
+    """Answers requests that are still being worked on when the server ends, so that nothing is logged as a failure."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Serve a request."""
+        try:
+            await self._app(scope, receive, send)
+        except asyncio.CancelledError:
+            await Refusal(503, "ended", "the studio has been ended").response()(scope, receive, send)
 
 
 class StudioHandlers:
@@ -120,10 +136,12 @@ class StudioHandlers:
         return JSONResponse(self._document.describe())
 
     async def findings(self, request: Request) -> Response:
-        """Remarks on the part, and symmetries of its geometry."""
-        found = await asyncio.to_thread(self._document.findings)
-        symmetries = await asyncio.to_thread(self._document.found_symmetries)
-        return JSONResponse({"findings": found, "symmetries": symmetries})
+        """Remarks on the part."""
+        return JSONResponse({"findings": await asyncio.to_thread(self._document.findings)})
+
+    async def symmetries(self, request: Request) -> Response:
+        """Symmetries of the geometry of the part."""
+        return JSONResponse({"symmetries": await asyncio.to_thread(self._document.found_symmetries)})
 
     async def edit(self, request: Request) -> Response:
         """Carry out an edit."""

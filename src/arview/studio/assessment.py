@@ -83,6 +83,8 @@ class Assessments:
         self._key: tuple[str, ViewRange] | None = None
         self._done: Assessment | None = None
         self._error = ""
+        self._drawing = threading.Lock()
+        self._renderer: tuple[Assessment, ZBufferRenderer] | None = None
 
     def of(self, part: Part) -> tuple[Assessment | None, str]:
         """The assessment of a part, or None while it is being made; and the reason why it cannot be made."""
@@ -98,8 +100,11 @@ class Assessments:
         done, _ = self.of(part)
         if done is None or not 0 <= index < len(done.views):
             return None
-        renderer = ZBufferRenderer(part.model, done.views.camera.scaled(2 * TILE_PX, 2 * TILE_PX))
-        tile = view_tile(renderer, done.views, index, done.unique, TILE_PX)
+        with self._drawing:
+            if self._renderer is None or self._renderer[0] is not done:
+                camera = done.views.camera.scaled(2 * TILE_PX, 2 * TILE_PX)
+                self._renderer = done, ZBufferRenderer(part.model, camera)
+            tile = view_tile(self._renderer[1], done.views, index, done.unique, TILE_PX)
         _, png = cv2.imencode(".png", cv2.cvtColor(tile, cv2.COLOR_RGB2BGR))
         return png.tobytes()
 

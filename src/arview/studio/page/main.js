@@ -4,7 +4,7 @@ import { ask, post } from "./api.js";
 import { find, icon, make } from "./dom.js";
 import { Picker } from "./picker.js";
 import { Settings } from "./settings.js";
-import { Store } from "./store.js";
+import { EDITING, Store } from "./store.js";
 import { DatumsTab } from "./tabs/datums.js";
 import { PartTab } from "./tabs/part.js";
 import { PhotosTab } from "./tabs/photos.js";
@@ -39,7 +39,11 @@ tabs.add(DatumsTab, store);
 tabs.add(RangeTab, store);
 tabs.add(ViewsTab, store, (index) => dots.mark(index));
 tabs.add(SymmetriesTab, store);
-tabs.add(PhotosTab, store, () => showExtras());
+tabs.add(PhotosTab, store, () => {
+  const before = shell.radius;
+  showExtras();
+  if (tabs.current === "Photos" && Math.abs(shell.radius - before) > 1) stage.reach(reach());
+});
 tabs.add(TrialTab, store);
 tabs.add(TextTab, store);
 
@@ -77,6 +81,7 @@ async function loadMesh() {
     const buffer = await store.during("Loading the CAD", async () => (await ask(`/api/mesh${query}`)).arrayBuffer());
     if (!buffer || loaded !== key) return;
     stage.setMesh(buffer);
+    marks.show(store.part);
     find("loading").hidden = true;
     performance.mark(query ? "arview:coarse" : "arview:full", { detail: hash });
   }
@@ -85,8 +90,13 @@ async function loadMesh() {
 function showTab(name, before) {
   const isOutside = (tab) => ["Range", "Views", "Photos"].includes(tab);
   showExtras();
-  if (!store.part || isOutside(name) === isOutside(before)) return;
-  stage.reach(isOutside(name) ? 1.1 * shell.radius : stage.radius);
+  if (!store.part || (isOutside(name) === isOutside(before) && name !== "Photos" && before !== "Photos")) return;
+  stage.reach(reach());
+}
+
+/** Radius, mm, of what the open tab shows. */
+function reach() {
+  return ["Range", "Views", "Photos"].includes(tabs.current) ? 1.1 * shell.radius : stage.radius;
 }
 
 /** What the open tab shows around the part. */
@@ -94,11 +104,12 @@ function showExtras() {
   const { part, views } = store, tab = tabs.current;
   if (!part) return;
   const isShell = ["Range", "Views", "Photos"].includes(tab), plan = tabs.of("Photos").plan;
-  shell.show(isShell ? part.view_range : null, tab === "Range");
+  const planned = plan && { ...part.view_range, distance_mm: [plan.distance_mm, plan.distance_mm] };
+  shell.show(isShell ? (tab === "Photos" && planned) || part.view_range : null, tab === "Range");
   const signs = { Views: () => (views?.views ?? []).map((view) => ({ direction: view.direction, sign: view.weak })),
     Range: () => (store.isAssessing ? [] : views?.views ?? []).map((view) => ({ direction: view.direction, sign: view.weak })),
     Photos: () => (plan?.photos ?? []).map((one) => ({ direction: one.direction, sign: "photo" })) };
-  dots.show(signs[tab]?.() ?? [], tab === "Photos" ? plan?.distance_mm ?? 1 : isShell ? shell.radius : 1);
+  dots.show(signs[tab]?.() ?? [], isShell ? shell.radius : 1);
   const keys = { Views: ["fine", "plain", "alike"], Range: ["fine", "plain", "alike"], Photos: ["photo"] }[tab] ?? [];
   const words = { fine: "distinct view", plain: "plain view", alike: "confused view", photo: "photo" };
   find("legend").replaceChildren(...keys.map((key) => sign(key, words[key])));
@@ -119,6 +130,7 @@ function peek(index, x, y) {
   figure.style.transform = `translate(${Math.max(4, left)}px, ${Math.max(4, Math.min(y - 40, stage.height - 280))}px)`;
 }
 
+stage.addEventListener("drawn", ({ detail }) => document.dispatchEvent(new CustomEvent("arview:drawn", { detail })));
 stage.addEventListener("hover", ({ detail }) => {
   const name = detail.index === null ? null : store.part?.components[detail.index]?.name ?? null;
   store.hover(name);
@@ -152,7 +164,7 @@ find("directions").addEventListener("click", ({ target }) => {
     isIgnoredShown = !isIgnoredShown;
     target.setAttribute("aria-pressed", String(isIgnoredShown));
     showComponents();
-  } else if (look) stage.look(look, ["Range", "Views", "Photos"].includes(tabs.current) ? 1.1 * shell.radius : stage.radius);
+  } else if (look) stage.look(look, reach());
 });
 
 /* --- the bar ---------------------------------------------------------------------------------------------- */
@@ -214,7 +226,7 @@ window.addEventListener("keydown", (event) => {
   else if (isCommand && !isTyping && key === "z") event.shiftKey ? store.redo() : store.undo();
   else if (isCommand && !isTyping && key === "y") store.redo();
   else if (event.key === "Escape") picker.close();
-  else if (key === "f" && !isTyping && !isCommand) stage.look("fit");
+  else if (key === "f" && !isTyping && !isCommand) stage.look("fit", reach());
   else if (key === "/" && !isTyping) find("search").focus();
   else return;
   event.preventDefault();
@@ -226,6 +238,7 @@ store.on("trouble", (text) => toast(text));
 store.on("busy", (labels) => {
   find("busy").textContent = labels.length ? `${labels.at(-1)} …` : "";
   document.body.classList.toggle("is-busy", labels.length > 0);
+  document.body.classList.toggle("is-editing", labels.includes(EDITING));
 });
 store.on("part", () => {
   const { part } = store;
@@ -233,7 +246,9 @@ store.on("part", () => {
   for (const name of [...store.selection]) if (indexOf(name) < 0) store.selection.delete(name);
   showBar();
   showComponents();
+  const before = shell.radius;
   showExtras();
+  if (["Range", "Views"].includes(tabs.current) && Math.abs(shell.radius / before - 1) > 0.1) stage.reach(reach());
   marks.show(part);
   loadMesh();
 });

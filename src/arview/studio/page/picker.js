@@ -32,6 +32,7 @@ export class Picker {
       make("ul", {}, rows.length ? rows : make("li", {}, "No plane, hole, cylinder or edge is recognised here.")),
     );
     this.box.hidden = false;
+    find("hover").hidden = true;
     const left = Math.min(x + 14, this.stage.width - this.box.offsetWidth - 8), top = Math.min(y + 14, this.stage.height - this.box.offsetHeight - 8);
     this.box.style.transform = `translate(${Math.max(8, left)}px, ${Math.max(8, top)}px)`;
     this.box.querySelector("li button")?.focus({ preventScroll: true });
@@ -40,12 +41,12 @@ export class Picker {
   close() {
     this.request = null;
     this.box.hidden = true;
-    this.marks.offer(null);
+    this.marks.offer();
   }
 
   #row({ datum, size_mm }) {
     const free = LABELS.find((label) => !this.store.part.datums.some((one) => one.label === label));
-    const preview = () => this.marks.offer(datum, size_mm);
+    const preview = () => this.marks.offer(this.store.part, datum, size_mm);
     const buttons = LABELS.map((label) => {
       const isTaken = this.store.part.datums.some((one) => one.label === label);
       return make("button", {
@@ -57,7 +58,7 @@ export class Picker {
         },
       }, label);
     });
-    return make("li", { onpointerenter: preview, onfocusin: preview, onpointerleave: () => this.marks.offer(null) },
+    return make("li", { onpointerenter: preview, onfocusin: preview, onpointerleave: () => this.marks.offer() },
       make("span", { class: "feature" }, wordsOf(datum)), make("small", {}, `${shown(size_mm, 1)} mm`), make("span", { class: "datum-buttons" }, buttons));
   }
 }

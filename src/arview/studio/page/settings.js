@@ -2,7 +2,7 @@
 
 import { field, find, make, numberInput, shown } from "./dom.js";
 
-const ROLES = [["inspect", "inspected"], ["base", "base: carries the others"], ["ignore", "ignored: not in the picture"]];
+const ROLES = [["inspect", "inspected"], ["base", "base"], ["ignore", "ignored"]];
 
 /** The value that all share, or undefined. */
 const shared = (rows, key) => rows.every((row) => row[key] === rows[0][key]) ? rows[0][key] : undefined;
@@ -33,7 +33,7 @@ export class Settings {
   }
 
   #roles(role) {
-    const select = make("select", { "data-key": "role", onchange: () => this.#set("role", select.value) },
+    const select = make("select", { "data-key": "role", title: "The base carries the others and is not judged; what is ignored is not in the picture", onchange: () => this.#set("role", select.value) },
       role === undefined ? make("option", { value: "" }, "(several)") : null,
       ROLES.map(([value, text]) => make("option", { value }, text)));
     select.value = role ?? "";

@@ -2,6 +2,8 @@
 
 import { get, post } from "./api.js";
 
+export const EDITING = "Checking the part";
+
 /** Events: "part" (edited), "selection", "hover", "visibility", "trouble" (detail: text), "busy" (detail: labels). */
 export class Store extends EventTarget {
   part = null;
@@ -88,7 +90,7 @@ export class Store extends EventTarget {
 
   /** Edits go one after the other. */
   #changed(path, json = {}) {
-    const step = this.#queue.then(() => this.during("Checking the part", () => post(path, json)));
+    const step = this.#queue.then(() => this.during(EDITING, () => post(path, json)));
     this.#queue = step;
     return step.then((part) => {
       if (part) this.#take(part);

@@ -32,7 +32,7 @@ export class SymmetriesTab {
     if (this.key === key) return;
     this.key = key;
     this.found.replaceChildren(make("li", { class: "card" }, "Being looked for …"));
-    const answer = await this.store.during("Looking for symmetries", () => get("/api/findings"));
+    const answer = await this.store.during("Looking for symmetries", () => get("/api/symmetries"));
     this.rows = answer?.symmetries ?? [];
     this.#show();
   }

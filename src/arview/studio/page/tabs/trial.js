@@ -47,12 +47,13 @@ export class TrialTab {
       return;
     }
     const isTracked = answer.tracked > 0, picture = make("img", { alt: isTracked ? "The part, drawn where it was found" : "The picture: the part was not found" });
+    const large = make("button", { type: "button", class: "enlarge", title: "Large or small", "aria-label": "Show the picture large or small", onclick: () => large.classList.toggle("is-large") }, picture);
     picture.src = `/api/trial.jpg?n=${Date.now()}`;
     const count = answer.frames === 1 ? "" : ` in ${answer.tracked} of ${answer.frames} frames`;
     this.result.replaceChildren(
       make("div", { class: `verdict-box ${isTracked ? "pass" : "fail"}` }, icon(isTracked ? "pass" : "fail"),
         make("div", {}, make("b", { class: "trial-state" }, `${isTracked ? "tracked" : "not found"}${count}`), make("div", {}, isTracked ? `quality ${percent(answer.quality)}${answer.reason ? `; ${answer.reason}` : ""}` : answer.reason || "no reason is known"))),
-      picture, this.#presence(answer.components));
+      large, this.#presence(answer.components));
   }
 
   #presence(components) {

@@ -25,16 +25,17 @@ export class ViewsTab {
     if (isAssessing || !views) {
       this.verdict.className = "verdict-box busy";
       this.verdict.replaceChildren(make("b", {}, "The guide views are being made …"));
+      this.sheet.replaceChildren(); // its pictures would be those of the part before the edit
       return;
     }
     const { is_sufficient: isFine } = views;
     this.verdict.className = `verdict-box ${isFine ? "pass" : "fail"}`;
-    this.verdict.replaceChildren(icon(isFine ? "pass" : "fail"), make("div", {}, make("b", {}, isFine ? "sufficient" : "insufficient"), make("div", {}, views.reason || "The part can be told from its surroundings.")));
+    this.verdict.replaceChildren(icon(isFine ? "pass" : "fail"), make("div", {}, make("b", {}, isFine ? "sufficient" : "insufficient"), make("div", {}, reasonOf(views))));
     this.advice.replaceChildren();
     this.help.hidden = Boolean(views.error);
     this.shares.textContent = views.error ? "" : [
-      `${views.views.length} views: ${percent(views.plain_share)} plain, ${percent(views.confusable_share)} confused with another`, views.most_alike,
-    ].filter(Boolean).join(". ");
+      `${views.views.length} views are assessed: ${percent(views.plain_share)} plain, ${percent(views.confusable_share)} confused with another`, views.most_alike,
+    ].filter(Boolean).join("; ");
     this.sheet.replaceChildren(...views.views.map((view, index) => {
       const picture = make("img", { alt: "", loading: "lazy", width: "320", height: "320" });
       picture.src = pictureOf(views, index);
@@ -64,5 +65,8 @@ export class ViewsTab {
     this.advice.replaceChildren(...(rows.length ? rows : [make("li", { class: "card" }, "None of the changes that were tried is better. Components around the part, once they are in the CAD, would help.")]));
   }
 }
+
+/** The reason without the verdict, which stands before it. */
+const reasonOf = (views) => (views.reason || "the part can be told from its surroundings").replace(/^(in)?sufficient:\s*/, "");
 
 export const sign = (kind, text) => make("span", { class: "sign-key" }, make("i", { class: `sign ${kind}` }), text);

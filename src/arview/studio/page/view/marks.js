@@ -6,7 +6,7 @@ import { make } from "../dom.js";
 const { THREE } = window;
 
 const AXES = [["X", 0xe5484d, [1, 0, 0]], ["Y", 0x3aa655, [0, 1, 0]], ["Z", 0x3b82f6, [0, 0, 1]]];
-const DATUM = 0xd97706, ROUND_STEPS = 48;
+const DATUM = 0xd97706, OFFERED = 0xff2d9b, ROUND_STEPS = 48;
 
 /** Datum features as outlines with their letter, axes at the frame's origin, and what a click would take. */
 export class Marks {
@@ -28,7 +28,7 @@ export class Marks {
     const scale = 0.12 * part.diameter_mm;
     for (const datum of part.datums) {
       const size = Math.min(2 * scale, datum.size_mm ?? scale);
-      this.group.add(lines(outlineOf(datum, size), DATUM));
+      this.group.add(lines(outlineOf(datum, size), DATUM), this.#face(part, datum, DATUM));
       const lift = plus(datum.point_mm, datum.direction, datum.feature === "plane" ? 0.6 * scale : 0.5 * scale);
       this.#label(lift, datum.label, "datum");
     }
@@ -40,14 +40,25 @@ export class Marks {
     this.stage.draw();
   }
 
-  /** Outline of a feature that is offered, or nothing. */
-  offer(table, size_mm) {
+  /** Show a feature that is offered, or nothing. */
+  offer(part, table, size_mm) {
     clear(this.preview);
     if (table) {
       const datum = { ...table, direction: table.normal ?? table.axis };
-      this.preview.add(lines(outlineOf(datum, Math.max(1e-6, size_mm)), 0xff2d9b));
+      this.preview.add(lines(outlineOf(datum, Math.max(1e-6, size_mm)), OFFERED), this.#face(part, datum, OFFERED));
     }
     this.stage.draw();
+  }
+
+  /** The faces of a plane, coloured. */
+  #face(part, datum, color) {
+    const geometry = new THREE.BufferGeometry(), index = part.components.findIndex((one) => one.name === datum.component);
+    const corners = datum.feature === "plane" && index >= 0 ? this.stage.planeOf(index, datum.point_mm, unit(datum.direction)) : [];
+    geometry.setAttribute("position", new THREE.BufferAttribute(new Float32Array(corners), 3));
+    const material = new THREE.MeshBasicMaterial({ color, transparent: true, opacity: 0.35, side: THREE.DoubleSide, depthWrite: false });
+    const mesh = new THREE.Mesh(geometry, material);
+    mesh.frustumCulled = false;
+    return mesh;
   }
 
   #label(point, text, kind) {
@@ -85,9 +96,8 @@ function outlineOf(datum, size) {
     .map((k) => 2 * Math.PI * k / ROUND_STEPS).map((angle) => at(radius * Math.cos(angle), radius * Math.sin(angle), height));
   const half = 0.5 * size;
   if (datum.feature === "plane") {
-    const square = [[-half, -half], [half, -half], [half, half], [-half, half]];
-    const sides = square.flatMap((corner, k) => [at(...corner), at(...square[(k + 1) % 4])]);
-    return [...sides, point, at(0, 0, 0.5 * half)];
+    const short = 0.2 * half;
+    return [at(-short, 0), at(short, 0), at(0, -short), at(0, short), point, at(0, 0, 0.5 * half)];
   }
   if (datum.feature === "edge") return [at(0, 0, -half), at(0, 0, half)];
   if (datum.diameter_mm) {

@@ -62,6 +62,21 @@ export class MeshData {
     return best;
   }
 
+  /** Positions of the corners of a component's faces in a plane. */
+  planeOf(index, point, normal) {
+    const { positions: p, corners: c } = this, [first, count] = this.ranges[index], { low, high } = this.boxes[index];
+    const limit = 1e-4 * Math.hypot(...low.map((value, axis) => high[axis] - value)), level = point[0] * normal[0] + point[1] * normal[1] + point[2] * normal[2];
+    const found = [];
+    for (let k = 3 * first; k < 3 * (first + count); k += 3) {
+      const isFlat = [0, 1, 2].every((step) => {
+        const at = 3 * c[k + step];
+        return Math.abs(p[at] * normal[0] + p[at + 1] * normal[1] + p[at + 2] * normal[2] - level) < limit;
+      });
+      if (isFlat) for (let step = 0; step < 3; step++) found.push(...p.subarray(3 * c[k + step], 3 * c[k + step] + 3));
+    }
+    return found;
+  }
+
   /** Möller and Trumbore (1997). */
   #hitComponent(index, [ox, oy, oz], [dx, dy, dz], limit) {
     const { positions: p, corners: c } = this, [first, count] = this.ranges[index];

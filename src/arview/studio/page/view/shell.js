@@ -42,7 +42,7 @@ export class Shell {
 
   /** Radius at which the dots of views and photos are drawn, mm. */
   get radius() {
-    return this.#range.distance_mm[0];
+    return this.#range?.distance_mm[0] ?? 1;
   }
 
   #build() {

@@ -129,6 +129,11 @@ export class Stage extends EventTarget {
     return level.data.hit(origin, direction, this.isOpen);
   }
 
+  /** Corners of a component's faces in a plane, or none while the full mesh is not there. */
+  planeOf(index, point, normal) {
+    return this.#levels.full?.data.planeOf(index, point, normal) ?? [];
+  }
+
   get isComplete() {
     return this.#levels.full !== null;
   }
@@ -168,7 +173,8 @@ export class Stage extends EventTarget {
     this.camera.far = distance + span;
     this.camera.updateProjectionMatrix();
     this.renderer.render(this.scene, this.camera);
-    this.dispatchEvent(new CustomEvent("drawn", { detail: { level: active === coarse ? "coarse" : "full" } }));
+    const clip_from_model = new THREE.Matrix4().multiplyMatrices(this.camera.projectionMatrix, this.camera.matrixWorldInverse).toArray();
+    this.dispatchEvent(new CustomEvent("drawn", { detail: { level: active?.data.isCoarse ? "coarse" : active ? "full" : "none", clip_from_model } }));
   }
 
   #drag(isDragged) {
