@@ -22,6 +22,10 @@ pytestmark = [pytest.mark.browser, pytest.mark.slow]
 SAMPLE = Path(__file__).parents[2] / "samples" / "bracket_plate"
 RIM_MM = 0.3
 """Outside the rim of a hole of 12 mm, where the plate's top is clicked."""
+RECORD = """
+window.levels = [];
+document.addEventListener("arview:drawn", (event) => window.levels.push([event.detail.level, performance.now()]));
+"""
 
 
 @pytest.fixture(scope="module")
@@ -52,8 +56,10 @@ def frame_of_the_clip(path: Path) -> Path:
 
 
 def test_from_a_bare_step_file_to_a_tracked_part(chromium: Any, tmp_path: Path) -> None:
-    (tmp_path / "bracket.step").write_bytes((SAMPLE / "bracket_plate.step").read_bytes())
-    with running_studio(tmp_path / "bracket.step") as studio, opened(chromium, studio, tmp_path) as page:
+    folder = tmp_path / "bracket"
+    folder.mkdir()
+    (folder / "bracket.step").write_bytes((SAMPLE / "bracket_plate.step").read_bytes())
+    with running_studio(folder / "bracket.step") as studio, opened(chromium, studio, tmp_path) as page:
         page.photograph("opened")
         page.select("base_plate")
         page.set("role", "base")
@@ -121,7 +127,7 @@ def test_from_a_bare_step_file_to_a_tracked_part(chromium: Any, tmp_path: Path) 
         page.page.wait_for_selector("#unsaved", state="hidden")
         page.tab("Text")
         page.photograph("saved")
-    saved = load_part(tmp_path / "part.toml")
+    saved = load_part(folder / "part.toml")
     assert saved.component_settings("base_plate").role == "base"
     assert saved.component_settings("nut_1").position_tolerance_mm == 0.8
     assert [datum.label for datum in saved.datums] == ["A", "B", "C"]
@@ -217,9 +223,7 @@ def test_five_hundred_components(chromium: Any, tmp_path: Path) -> None:
             part = studio.get("/api/part")
             assert sum(row["position_tolerance_mm"] == 0.4 for row in part["components"]) >= 25
             box = page.page.locator("#canvas").bounding_box()
-            page.page.evaluate(
-                "window.levels = []; document.addEventListener('arview:drawn', (event) => window.levels.push([event.detail.level, performance.now()]))"
-            )
+            page.page.evaluate(RECORD)
             page.page.mouse.move(box["x"] + 300, box["y"] + 200)
             page.page.mouse.down()
             for step in range(20):
@@ -228,7 +232,6 @@ def test_five_hundred_components(chromium: Any, tmp_path: Path) -> None:
             page.page.wait_for_timeout(500)
             levels = page.page.evaluate("window.levels")
             faces = sum(row["faces"] for row in part["components"])
-            print(
-                f"{faces} faces; {len(levels)} pictures while dragging, median of {np.median(np.diff([at for _, at in levels])):.0f} ms"
-            )
+            step_ms = np.median(np.diff([at_ms for _, at_ms in levels]))
+            print(f"{faces} faces; {len(levels)} pictures while dragging, median of {step_ms:.0f} ms")
             assert {"coarse"} == {level for level, _ in levels[2:-2]} and levels[-1][0] == "full"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 
 import numpy as np
@@ -20,7 +21,8 @@ def mesh_bytes(model: Model, is_coarse: bool) -> bytes:
 
     The header holds ``vertices``, ``faces`` and ``edges`` (counts), ``ranges`` (first and number of faces of each
     component, in their order), ``edge_ranges``, and ``is_coarse``. Face k of a component, counted from its first one,
-    is the face of that number of the component's own mesh unless the mesh is coarse. All begins at multiples of four.
+    is the face of that number of the component's own mesh unless the mesh is coarse. A coarse mesh has no edge lines,
+    because finding them takes longer than all the rest. All begins at multiples of four.
     """
     points: list[NDArray[np.float32]] = []
     corners: list[NDArray[np.uint32]] = []
@@ -37,23 +39,26 @@ def mesh_bytes(model: Model, is_coarse: bool) -> bytes:
         ranges.append([first_face, len(faces)])
         first_vertex += len(vertices)
         first_face += len(faces)
-    edges = mesh_edges(model)
-    lines, edge_ranges, first_line = [], [], 0
-    for index in range(len(model.components)):
-        ends = edges.ends[edges.is_crease & (edges.component == index)]
-        if is_coarse:
-            ends = ends[:: max(1, round(total / COARSE_FACES))]
-        lines.append(edges.vertices_in_model[ends].reshape(-1, 3).astype(np.float32))
-        edge_ranges.append([first_line, len(ends)])
-        first_line += len(ends)
+    lines, edge_ranges = ([], [[0, 0]] * len(ranges)) if is_coarse else _crease_lines(model)
+    edge_count = sum(count for _, count in edge_ranges)
     header = {
-        "vertices": first_vertex, "faces": first_face, "edges": first_line,
+        "vertices": first_vertex, "faces": first_face, "edges": edge_count,
         "ranges": ranges, "edge_ranges": edge_ranges, "is_coarse": is_coarse,
     }  # fmt: skip
     text = json.dumps(header).encode()
     text += b" " * (-len(text) % 4)
-    arrays = [np.concatenate(points), np.concatenate(corners), np.concatenate(lines)]
+    arrays = [np.concatenate(points), np.concatenate(corners), np.concatenate([*lines, np.zeros((0, 3), np.float32)])]
     return b"".join([np.uint32(len(text)).tobytes(), text, *(array.tobytes() for array in arrays)])
+
+
+def _crease_lines(model: Model) -> tuple[list[NDArray[np.float32]], list[list[int]]]:
+    """End points of the crease edges, those of a component together; first and number of lines of each component."""
+    edges = mesh_edges(model)
+    creases = np.flatnonzero(edges.is_crease)
+    creases = creases[np.argsort(edges.component[creases], kind="stable")]
+    bounds = np.searchsorted(edges.component[creases], np.arange(len(model.components) + 1))
+    points = edges.vertices_in_model[edges.ends[creases]].reshape(-1, 3).astype(np.float32)
+    return [points], [[int(first), int(end - first)] for first, end in itertools.pairwise(bounds)]
 
 
 def clustered(vertices: Array, faces: NDArray[np.int32], wanted: int) -> tuple[Array, NDArray[np.int32]]:

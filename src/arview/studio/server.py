@@ -9,8 +9,14 @@ from arview.live.security.access import Access
 from arview.live.security.addresses import LOOPBACK
 from arview.live.server.live_server import open_endpoint
 from arview.live.server.uvicorn_server import UvicornServer
+from arview.live.server.workers import WorkerPool
 from arview.studio.app import make_app
 from arview.studio.document import StudioDocument
+
+WORKERS = 8
+"""Threads for the work that takes time."""
+WORK_TIMEOUT_S = 1800.0
+"""Longest time for one piece of work."""
 
 
 class StudioServer:
@@ -45,6 +51,8 @@ class StudioServer:
 
     async def serve(self, on_ready: Callable[[], None] = lambda: None) -> None:
         """Serve until `stop`."""
+        # Work that is under way when the server ends is not waited for.
+        asyncio.get_running_loop().set_default_executor(WorkerPool(WORKERS, WORK_TIMEOUT_S))
         task = asyncio.ensure_future(self._server.run_until_stopped())
         on_ready()
         await task

@@ -25,6 +25,7 @@ history.replaceState(null, "", location.pathname); // the token stays out of boo
 for (const element of document.querySelectorAll("[data-icon]")) element.prepend(icon(element.dataset.icon));
 
 const store = new Store(), stage = new Stage(find("canvas"));
+find("no-webgl").hidden = Boolean(stage.renderer);
 const marks = new Marks(stage, find("marks"));
 const shell = new Shell(stage, find("handles"), { onDrag: (range) => tabs.of("Range").show(range), onDrop: (range) => declare(store, range) });
 const dots = new Dots(stage, find("overlay"), { onHover: peek, onChoose: (index) => {
@@ -79,12 +80,14 @@ async function loadMesh() {
   stage.clearMesh("full");
   for (const query of isLarge ? ["?coarse=1", ""] : [""]) {
     const buffer = await store.during("Loading the CAD", async () => (await ask(`/api/mesh${query}`)).arrayBuffer());
+    if (!buffer) store.setReady();
     if (!buffer || loaded !== key) return;
     stage.setMesh(buffer);
     marks.show(store.part);
     find("loading").hidden = true;
     performance.mark(query ? "arview:coarse" : "arview:full", { detail: hash });
   }
+  store.setReady();
 }
 
 function showTab(name, before) {

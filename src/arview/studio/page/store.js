@@ -12,6 +12,8 @@ export class Store extends EventTarget {
   assembly = null;
   hovered = null;
   hidden = new Set();
+  /** Kept once the CAD is drawn: what takes long waits for it. */
+  ready = new Promise((done) => { this.setReady = done; });
   #queue = Promise.resolve();
   #busy = new Map();
   #nextJob = 0;

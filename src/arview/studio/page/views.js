@@ -24,6 +24,8 @@ export class Views {
 
   async #ask() {
     const { store, key } = this;
+    await store.ready;
+    if (key !== this.key) return;
     try {
       const answer = await ask("/api/views"), found = await answer.json();
       if (key !== this.key) return;

@@ -49,6 +49,7 @@ export class PartTab {
   }
 
   async #check() {
+    await this.store.ready;
     const { revision } = this.store.part;
     if (this.revision === revision) return;
     this.revision = revision;

@@ -21,8 +21,12 @@ export class Stage extends EventTarget {
   constructor(canvas) {
     super();
     this.canvas = canvas;
-    this.renderer = new THREE.WebGLRenderer({ canvas, antialias: true, alpha: true, powerPreference: "high-performance" });
-    this.renderer.setPixelRatio(Math.min(2, window.devicePixelRatio));
+    try {
+      this.renderer = new THREE.WebGLRenderer({ canvas, antialias: true, alpha: true, powerPreference: "high-performance" });
+      this.renderer.setPixelRatio(Math.min(2, window.devicePixelRatio));
+    } catch {
+      this.renderer = null; // without WebGL the part is not drawn; labels, dots and clicks work all the same
+    }
     this.scene = new THREE.Scene();
     this.extras = new THREE.Group();
     this.camera = new THREE.PerspectiveCamera(FIELD_DEG, 1, 1, 1e5);
@@ -156,7 +160,7 @@ export class Stage extends EventTarget {
     const { clientWidth, clientHeight } = this.canvas.parentElement;
     if (!clientWidth || !clientHeight) return;
     [this.width, this.height] = [clientWidth, clientHeight];
-    this.renderer.setSize(clientWidth, clientHeight);
+    this.renderer?.setSize(clientWidth, clientHeight);
     this.camera.aspect = clientWidth / clientHeight;
     this.camera.updateProjectionMatrix();
     this.#render();
@@ -172,7 +176,8 @@ export class Stage extends EventTarget {
     this.camera.near = Math.max(1e-3 * this.radius, distance - span);
     this.camera.far = distance + span;
     this.camera.updateProjectionMatrix();
-    this.renderer.render(this.scene, this.camera);
+    this.camera.updateMatrixWorld();
+    this.renderer?.render(this.scene, this.camera);
     const clip_from_model = new THREE.Matrix4().multiplyMatrices(this.camera.projectionMatrix, this.camera.matrixWorldInverse).toArray();
     this.dispatchEvent(new CustomEvent("drawn", { detail: { level: active?.data.isCoarse ? "coarse" : active ? "full" : "none", clip_from_model } }));
   }
