@@ -155,6 +155,7 @@ def test_a_lone_block_is_insufficient_with_a_reason(chromium: Any, tmp_path: Pat
     (tmp_path / "block.stl").write_bytes(trimesh.creation.box((80, 50, 30)).export(file_type="stl"))
     (tmp_path / "part.toml").write_text('[part]\ncad = "block.stl"\nunit = "mm"\n')
     with running_studio(tmp_path / "part.toml") as studio, opened(chromium, studio, tmp_path) as page:
+        assert page.page.inner_text("#tree .leaf .name") == "block"
         page.page.wait_for_selector("#verdict.fail")
         page.page.click("#verdict")
         text = page.page.inner_text(".verdict-box")
@@ -162,6 +163,33 @@ def test_a_lone_block_is_insufficient_with_a_reason(chromium: Any, tmp_path: Pat
         assert page.page.locator(".tile.plain, .tile.alike").count() > 0
         page.page.wait_for_timeout(1000)
         page.photograph("block")
+
+
+def test_a_part_that_looks_the_same_after_a_turn(chromium: Any, tmp_path: Path) -> None:
+    """Its views are confused with those from the other side, and the symmetry that causes this can be confirmed."""
+    plate, pin = trimesh.creation.box((120, 60, 8)), trimesh.creation.cylinder(6, 24)
+    rib = trimesh.creation.box((6, 34, 30))
+    half = [(pin, (45, 15, 16)), (rib, (20, 5, 19)), (trimesh.creation.box((14, 10, 12)), (35, -18, 10))]
+    turn = trimesh.transformations.rotation_matrix(np.pi, (0, 0, 1))
+    placed = [mesh.copy().apply_translation(place) for mesh, place in half]
+    whole = trimesh.util.concatenate([plate, *placed, *(mesh.copy().apply_transform(turn) for mesh in placed)])
+    (tmp_path / "plate.stl").write_bytes(whole.export(file_type="stl"))
+    (tmp_path / "part.toml").write_text(
+        '[part]\ncad = "plate.stl"\nunit = "mm"\n[view_range]\ndistance_mm = [300.0, 500.0]\n'
+        "elevation_deg = [20.0, 70.0]\n"
+    )
+    with running_studio(tmp_path / "part.toml") as studio, opened(chromium, studio, tmp_path) as page:
+        page.tab("Views")
+        page.page.wait_for_selector(".tile")
+        assert page.page.locator(".tile.alike").count() > 20
+        page.photograph("alike")
+        page.tab("Symmetries")
+        page.page.get_by_role("button", name="Confirm").first.click()
+        page.until("document.body.innerText.includes('None that is not declared.')")
+        page.settled()
+        (symmetry,) = studio.get("/api/part")["symmetries"]
+        assert symmetry["order"] == 2 and abs(symmetry["axis"][2]) == pytest.approx(1.0, abs=1e-3)
+        page.photograph("symmetries")
 
 
 def test_a_refused_edit_is_told_and_changes_nothing(chromium: Any, tmp_path: Path) -> None:
@@ -221,7 +249,13 @@ def test_five_hundred_components(chromium: Any, tmp_path: Path) -> None:
             page.set("position_tolerance_mm", "0.4")
             page.photograph("large_selected")
             part = studio.get("/api/part")
-            assert sum(row["position_tolerance_mm"] == 0.4 for row in part["components"]) >= 25
+            assert sum(row["position_tolerance_mm"] == 0.4 for row in part["components"]) == 25
+            page.page.fill("#search", "")
+            page.page.locator("#tree .branch", has_text="row_4").click()
+            page.set("position_tolerance_mm", "0.6")
+            part = studio.get("/api/part")
+            assert sum(row["position_tolerance_mm"] == 0.6 for row in part["components"]) == 50
+            assert part["text"].count("position_tolerance_mm = 0.6") == 1  # one table with a pattern
             box = page.page.locator("#canvas").bounding_box()
             page.page.evaluate(RECORD)
             page.page.mouse.move(box["x"] + 300, box["y"] + 200)

@@ -75,7 +75,7 @@ class StudioDocument:
                     {
                         "index": index,
                         "name": settings.name,
-                        "path": list(part.paths[index]) if part.paths else [settings.name],
+                        "path": list(part.paths[index] if part.paths else ()) or [settings.name],
                         "role": settings.role,
                         "color": "#" + "".join(f"{round(255 * value):02x}" for value in component.color),
                         "position_tolerance_mm": settings.position_tolerance_mm,

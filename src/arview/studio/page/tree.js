@@ -146,7 +146,7 @@ export class Tree {
       const chosen = new Set(this.store.selection), isOff = row.names.every((name) => chosen.has(name));
       for (const name of row.names) isOff ? chosen.delete(name) : chosen.add(name);
       this.store.select(chosen);
-    } else this.store.select(row.names, row.node.component ? null : row.node.path.join("/"));
+    } else this.store.select(row.names, row.node.component || this.search.value.trim() ? null : row.node.path.join("/"));
     if (!shiftKey) this.#last = row;
     this.#focus(row);
   }

@@ -17,6 +17,7 @@ export class ViewsTab {
     this.sheet = make("div", { class: "sheet", role: "list", "aria-label": "Guide views" });
     panel.append(this.verdict, this.shares, this.help, this.advice, make("h3", {}, "Contact sheet"),
       make("p", { class: "key" }, sign("fine", "distinct"), sign("plain", "plain"), sign("alike", "confused")), this.sheet);
+    store.on("views part", () => this.#facts());
     store.on("views", () => this.#show());
   }
 
@@ -33,18 +34,26 @@ export class ViewsTab {
     this.verdict.replaceChildren(icon(isFine ? "pass" : "fail"), make("div", {}, make("b", {}, isFine ? "sufficient" : "insufficient"), make("div", {}, reasonOf(views))));
     this.advice.replaceChildren();
     this.help.hidden = Boolean(views.error);
-    this.shares.textContent = views.error ? "" : [
+    this.#facts();
+    this.sheet.replaceChildren(...views.views.map((view, index) => this.#tile(view, index)));
+  }
+
+  #facts() {
+    const { views } = this.store;
+    this.shares.textContent = !views || views.error ? "" : [
       `${views.views.length} views are assessed: ${percent(views.plain_share)} plain, ${percent(views.confusable_share)} confused with another`, views.most_alike,
+      this.store.part.symmetries.length && views.confusable_share > 0 ? "the verdict does not know the declared symmetry: views that it maps onto each other may be confused" : "",
     ].filter(Boolean).join("; ");
-    this.sheet.replaceChildren(...views.views.map((view, index) => {
-      const picture = make("img", { alt: "", loading: "lazy", width: "320", height: "320" });
-      picture.src = pictureOf(views, index);
-      const mark = () => this.onMark(index), unmark = () => this.onMark(null);
-      return make("button", {
-        class: `tile ${view.weak || "fine"}`, role: "listitem", type: "button", "aria-label": `View ${index}: ${wordsOfView(view)}`, title: wordsOfView(view),
-        onpointerenter: mark, onfocus: mark, onpointerleave: unmark, onblur: unmark,
-      }, picture, make("span", {}, make("i", { class: `sign ${view.weak || "fine"}` }), `${Math.round(view.azimuth_deg)}° / ${Math.round(view.elevation_deg)}°`));
-    }));
+  }
+
+  #tile(view, index) {
+    const picture = make("img", { alt: "", loading: "lazy", width: "320", height: "320" });
+    picture.src = pictureOf(this.store.views, index);
+    const mark = () => this.onMark(index), unmark = () => this.onMark(null);
+    return make("button", {
+      class: `tile ${view.weak || "fine"}`, role: "listitem", type: "button", "aria-label": `View ${index}: ${wordsOfView(view)}`, title: wordsOfView(view),
+      onpointerenter: mark, onfocus: mark, onpointerleave: unmark, onblur: unmark,
+    }, picture, make("span", {}, make("i", { class: `sign ${view.weak || "fine"}` }), `${Math.round(view.azimuth_deg)}° / ${Math.round(view.elevation_deg)}°`));
   }
 
   /** Bring a view of the sheet into sight. */
