@@ -39,7 +39,9 @@ class CadOptions:
     Attributes:
         detect_width_px: longer side of the pictures in which the part is searched for.
         max_detections: maximum number of photos searched.
-        first_detections: maximum number of photos searched while no two agree.
+        first_detections: maximum number of photos searched while none shows the part reliably.
+        more_detections: maximum number of photos searched where some show the part reliably, but too few: much of it is
+            hidden.
         agreeing: number of agreeing photos that ends the search.
         min_quality: detections of at least this quality vote, even if they would not be reliable by themselves.
         sightings: maximum number of detections per photo.
@@ -49,12 +51,15 @@ class CadOptions:
         max_views: maximum number of photos refined, spread over all directions, to limit time.
         rival_views: number of photos in which alternatives to the best vote are scored.
         min_support: minimum support of a similarity that is accepted, see `Support`.
+        clear_support: support of a component that is seen as it should be …
+        min_clear: … and number of such components with which a part is accepted of which the rest is hidden.
         clear_lead: an alternative whose support is less than this below the best one's makes the frame ambiguous.
         refine: options of the joint refinement.
     """
 
     detect_width_px: int = 800
     max_detections: int = 12
+    more_detections: int = 30
     first_detections: int = 6
     agreeing: int = 3
     min_quality: float = 0.1
@@ -65,6 +70,8 @@ class CadOptions:
     max_views: int = 30
     rival_views: int = 6
     min_support: float = 0.25
+    clear_support: float = 0.6
+    min_clear: int = 2
     clear_lead: float = 0.08
     refine: RefineOptions = field(default_factory=RefineOptions)
 
@@ -215,8 +222,8 @@ def _search(
     reasons: list[str] = []
     sure = 0
     enough = min(options.agreeing, len(photos))
-    for count, index in enumerate(order[: options.max_detections]):
-        if count >= options.first_detections and not votes:
+    for count, index in enumerate(order[: options.more_detections]):
+        if count >= (options.max_detections if votes else options.first_detections) and not sure:
             break
         if progress:
             progress("finding the part", count, min(len(order), options.max_detections))
@@ -237,6 +244,8 @@ def _search(
         votes = vote(sightings, views.center_in_model, views.diameter_mm)
         if votes and len(votes[0].sightings) >= enough:
             return votes, next(iter(detectors.values())).symmetries.near, NotFound("")
+    if votes and min(one.quality for one in votes[0].sightings) >= FOUND_QUALITY:
+        return votes, next(iter(detectors.values())).symmetries.near, NotFound("")
     if sure >= enough:
         apart = f"the part was found in {sure} photos, but at places that contradict each other"
         return [], np.zeros((0, 3, 3)), NotFound(apart, is_contradiction=True)
@@ -280,7 +289,15 @@ def _refined(
     refiner = JointRefiner(model, base, views, options.refine)
     fit = refiner.refine(scored[0][1])
     support = refiner.support(fit.similarity, fit.samples)
-    if max(support.score, support.base_score) < options.min_support:
+    is_whole = max(support.score, support.base_score) >= options.min_support
+    clear = [one.name for one, share in zip(model.components, support.by_component, strict=True)
+             if share >= options.clear_support]  # fmt: skip
+    if not is_whole and len(clear) >= options.min_clear:
+        warnings.append(
+            f"only some of the part is in view: of the edges of {len(model.components)} components those of "
+            f"{', '.join(clear)} were clearly found"
+        )
+    elif not is_whole:
         reason = (
             f"the part was found in {len(votes[0].sightings)} photos, but with the poses of these only "
             f"{100 * support.share:.0f} % of its edges are where they should be "

@@ -30,6 +30,9 @@ class ConsistencyOptions:
         min_near: smallest share of points near the surface.
         max_behind: largest share of points behind the surface.
         min_edges: smallest share of edges found beyond chance, in the median photo.
+        min_near_in_part: share of points near the surface by which a part is consistent whose edges are mostly hidden.
+        clear_edges, min_clear: share of the edges of a component that counts as seen, and number of such components that
+            a part needs then.
         min_relative_edges: the same in one photo, relative to the median photo; a photo below does not fit.
         max_misfits: largest share of photos that do not fit.
     """
@@ -42,6 +45,9 @@ class ConsistencyOptions:
     min_near: float = 0.6
     max_behind: float = 0.15
     min_edges: float = 0.25
+    min_near_in_part: float = 0.9
+    clear_edges: float = 0.6
+    min_clear: int = 2
     min_relative_edges: float = 0.45
     max_misfits: float = 0.1
 
@@ -72,7 +78,10 @@ def check_consistency(
     near = float(np.mean(np.abs(offsets) < tolerance_mm)) if len(offsets) >= o.min_points else None
     behind = float(np.mean(offsets < -tolerance_mm)) if len(offsets) >= o.min_points else None
     against = []
-    if usual < o.min_edges:
+    # Where much of the part is hidden, the points on what is seen must lie on the CAD instead.
+    clear = int(np.sum(support.by_component >= o.clear_edges))
+    is_in_part = clear >= o.min_clear and near is not None and near >= o.min_near_in_part
+    if usual < o.min_edges and not is_in_part:
         against.append(
             f"only {100 * support.share:.0f} % of the CAD's edges are where they should be "
             f"({100 * support.chance:.0f} % would be by chance)"
