@@ -11,6 +11,7 @@ import pytest
 from arview.inspection import (
     ComponentDeviation,
     HalvesDifference,
+    MeasuredPresence,
     Repeatability,
     Verdict,
     load_inspection,
@@ -19,12 +20,12 @@ from arview.inspection import (
 from arview.measurement.folder import MetricReconstruction
 from arview.measurement.options import MeasureOptions
 from arview.measurement.repeatability import BUDGET_LINE, compare, measure_halves, with_repeatability
-from arview.measurement.seen_from import SeenFrom, seen_from, with_seen_from
+from arview.measurement.seen_from import SeenFrom, is_mostly_hidden, seen_from, with_hidden, with_seen_from
 from arview.reconstruction.coverage import ComponentCoverage, CoverageOptions
 from arview.reconstruction.scale.types import Consistency, ScaleEvidence, ScaleResult
 from arview.reconstruction.types import PosedPhoto, SparseModel
 from arview.report.halves import repeatability_context
-from helpers.inspections import deviation, inspection, not_measured
+from helpers.inspections import deviation, inspection, missing, not_measured
 from helpers.photo_scene import CAMERA, bench, photograph, ring, write_photos
 from helpers.plate_scene import as_built, part
 
@@ -100,6 +101,17 @@ def test_a_component_seen_from_too_few_sides_says_so() -> None:
     many = SeenFrom({"block": ComponentCoverage("block", tuple(range(9)), 5, 80.0, 90.0)}, CoverageOptions())
     kept = with_seen_from(one, many).details
     assert kept is not None and one.details is not None and kept.photos == 9 and kept.notes == one.details.notes
+
+
+def test_what_is_hidden_is_not_missing() -> None:
+    """Of a part that is half covered, 40 % of the edges are found, 28 % by chance; of one that is seen, most are."""
+    assert is_mostly_hidden(Consistency(True, "", 0.40, 0.28)) and not is_mostly_hidden(Consistency(True, "", 0.7, 0.2))
+    assert not is_mostly_hidden(Consistency(True, ""))
+    found = with_hidden(missing("block", np.zeros(3)))
+    assert (found.verdict, found.finding, found.presence) == (Verdict.NOT_MEASURED, None, MeasuredPresence.NOT_SEEN)
+    assert found.details is not None and "whether it is missing cannot be told" in found.details.notes[0]
+    seen = measured((0.1, 0.0, 0.0))
+    assert with_hidden(seen) is seen
 
 
 @pytest.fixture(scope="module")

@@ -40,7 +40,7 @@ from arview.measurement.records import (
     in_partial_frame,
     provenance_of,
 )
-from arview.measurement.seen_from import seen_from, with_seen_from
+from arview.measurement.seen_from import is_mostly_hidden, seen_from, with_hidden, with_seen_from
 from arview.measurement.types import Move, NotMeasured
 from arview.measurement.uncertainty.combine import CombinedMove
 from arview.measurement.uncertainty.pose_propagation import PosePropagation
@@ -107,10 +107,11 @@ def _measure(
     else:
         poses = PosePropagation(reconstruction.sparse, part.model, alignment, base)
     deviations = []
-    seen = seen_from(reconstruction.sparse, part.model)
+    seen, is_hidden = seen_from(reconstruction.sparse, part.model), is_mostly_hidden(consistency)
     for done, name in enumerate(names, 1):
         record = component_record(name, results[name], measurands[name], alignment, poses, part, options)
-        deviations.append(with_seen_from(in_partial_frame(record, failed), seen))
+        record = in_partial_frame(record, failed)
+        deviations.append(with_seen_from(with_hidden(record) if is_hidden else record, seen))
         tell("uncertainty", done, len(names))
     foreign: tuple[ForeignReport, ...] = ()
     distances: DistanceReport | None = None

@@ -6,8 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 from arview.cad.model import Model
-from arview.inspection import ComponentDeviation
+from arview.inspection import ComponentDeviation, Finding, MeasuredPresence, Verdict
 from arview.reconstruction.coverage import ComponentCoverage, CoverageOptions, coverage
+from arview.reconstruction.scale.types import Consistency
 from arview.reconstruction.types import SparseModel
 
 
@@ -42,6 +43,25 @@ def with_seen_from(record: ComponentDeviation, seen: SeenFrom) -> ComponentDevia
     note = _few(covered, seen.options, record.distance_mm is not None)
     notes = (*record.details.notes, *((note,) if note else ()))
     return replace(record, details=replace(record.details, photos=len(covered.photos), notes=notes))
+
+
+def is_mostly_hidden(consistency: Consistency, options: CoverageOptions | None = None) -> bool:
+    """Whether most of the CAD's edges are hidden in the photos, although what is seen of the part fits."""
+    share, chance = consistency.edges_found, consistency.edges_by_chance
+    if share is None or chance is None:
+        return False
+    return (share - chance) / (1.0 - min(chance, 0.95)) < (options or CoverageOptions()).hidden_edges
+
+
+def with_hidden(record: ComponentDeviation) -> ComponentDeviation:
+    """The record of a component of a part that is mostly hidden: without a trace it is not seen, not missing."""
+    if record.finding is not Finding.MISSING or record.details is None:
+        return record
+    note = "nothing of it is seen, and as most of the part is hidden, whether it is missing cannot be told"
+    details = replace(record.details, notes=(note, *record.details.notes))
+    return replace(
+        record, verdict=Verdict.NOT_MEASURED, finding=None, presence=MeasuredPresence.NOT_SEEN, details=details
+    )
 
 
 def _few(covered: ComponentCoverage, options: CoverageOptions, is_measured: bool) -> str:

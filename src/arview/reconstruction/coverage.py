@@ -26,6 +26,7 @@ class CoverageOptions:
     direction_deg: float = 15.0  # views that differ by less count as one direction
     photos_wanted: int = 4  # one more than the minimum that can contradict each other
     directions_wanted: int = 3  # two determine a distance, the third confirms it
+    hidden_edges: float = 0.25  # share of the CAD's edges, beyond chance, below which most of the part is hidden
     one_side_deg: float = 40.0  # if no two views of the part differ by more, depth is poorly known
     alone_deg: float = 35.0  # a photo farther than this from its nearest neighbour cannot be matched well
     gap_deg: float = 150.0  # azimuth range without photos that is reported

@@ -278,6 +278,8 @@ class ComponentEdges:
         votes = _vote(
             found.hypotheses_mm[order], weight[order], found.directions[order], shifts, max(0.4, 1.2 * px_mm), 0.99
         )
+        if not votes.max() > 0.0:  # nothing but plain surface where it should be
+            return np.eye(4)
         best = shifts[np.flatnonzero(votes > 0.99 * votes.max())[0]]
         return rigid(np.eye(3), best)
 

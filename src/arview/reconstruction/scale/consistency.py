@@ -31,7 +31,7 @@ class ConsistencyOptions:
         max_behind: largest share of points behind the surface.
         min_edges: smallest share of edges found beyond chance, in the median photo.
         min_near_in_part: share of points near the surface by which a part is consistent whose edges are mostly hidden.
-        clear_edges, min_clear: share of the edges of a component that counts as seen, and number of such components that
+        min_near_in_part: share of points near the surface by which a part is consistent that is mostly hidden.
             a part needs then.
         min_relative_edges: the same in one photo, relative to the median photo; a photo below does not fit.
         max_misfits: largest share of photos that do not fit.
