@@ -63,3 +63,6 @@ def running_studio(path: Path) -> Iterator[Studio]:
         server.stop()
         thread.join(20)
         assert not thread.is_alive(), "the studio did not end"
+        for one in threading.enumerate():  # native code that runs while the interpreter ends would abort it
+            if one.name in ("arview-studio-views", "arview-worker"):
+                one.join(300)

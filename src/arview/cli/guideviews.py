@@ -119,11 +119,12 @@ the commands check, guideviews and annotate.""",
 )
 @UNIT
 @click.option("--no-browser", is_flag=True, help="Print the address, open no browser.")
-@click.pass_context
-def studio(ctx: click.Context, part: str, port: int, unit: str | None, no_browser: bool) -> None:
+def studio(part: str, port: int, unit: str | None, no_browser: bool) -> None:
     """Set up PART, a CAD or part file, on a local page."""
     import asyncio
+    import os
     import signal
+    import sys
     import webbrowser
 
     from arview.cli.live import require_extra
@@ -146,4 +147,6 @@ def studio(ctx: click.Context, part: str, port: int, unit: str | None, no_browse
             webbrowser.open(server.link)
 
     asyncio.run(serve())
-    ctx.exit(ExitCode.INTERRUPTED)
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(ExitCode.INTERRUPTED)  # threads that still make views are in native code, which aborts at an orderly end
