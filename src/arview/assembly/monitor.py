@@ -160,7 +160,7 @@ class AssemblyMonitor:
         self.options = options or MonitorOptions()
         self._views, self._camera, self._model = views, camera, model
         self._lines: PresentLines | None = None
-        self._turned = TurnedPoses(
+        self._turned: TurnedPoses = TurnedPoses(
             model.components, base_of(model), self.options.turned_poses, None if like is None else like._turned
         )
         self._has_components = len(model.components) > 1

@@ -75,12 +75,12 @@ def measure_halves(
 def compare(first: ComponentDeviation, second: ComponentDeviation) -> HalvesDifference:
     """Difference of two independent measurements of one component, beside what their covariances allow."""
     uncertainties = (first.uncertainty_mm, second.uncertainty_mm)
-    parts = [_displacement(one) for one in (first, second)]
-    if parts[0] is None or parts[1] is None:
+    ours, theirs = _displacement(first), _displacement(second)
+    if ours is None or theirs is None:
         missing = sum(one.finding is Finding.MISSING for one in (first, second))
         reason = ("half of the photos cannot measure it alone", "missing in one half only", "missing in both halves")
         return HalvesDifference(first.name, uncertainties_mm=uncertainties, reason=reason[missing])
-    (one, own_axes, one_seen), (other, other_axes, other_seen) = parts
+    (one, own_axes, one_seen), (other, other_axes, other_seen) = ours, theirs
     if not np.allclose(own_axes, other_axes, atol=1e-6):
         own_axes = np.eye(3)
         one_seen, other_seen = (np.array([v is not None for v in c.displacement_mm]) for c in (first, second))

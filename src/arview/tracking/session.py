@@ -115,7 +115,9 @@ class TrackingSession:
         self._base: BaseDetection = (
             BaseDetection(views, camera, model, o.detector, o.base_detection) if like is None else like._base
         )
-        self.components = AssemblyMonitor(views, camera, model, like=None if like is None else like.components)
+        self.components: AssemblyMonitor = AssemblyMonitor(
+            views, camera, model, like=None if like is None else like.components
+        )
         self.appearance_memory = AppearanceMemory(views, camera)
         self._search_plan = SearchPlan(views, camera, o)
         self.identity = IdentityMonitor(views, camera, o.identity, serials)

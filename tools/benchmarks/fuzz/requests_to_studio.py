@@ -65,7 +65,7 @@ POSTS: tuple[tuple[str, bytes], ...] = (
     ("/api/trial?name=a.mp4", b"x"),
     ("/api/trial?name=../a.sh", b"x"),
 )
-REQUESTS = st.one_of(
+REQUESTS: st.SearchStrategy[Any] = st.one_of(
     st.tuples(st.just("GET"), st.sampled_from([(path, b"") for path in GETS]), st.just([]), st.just([])),
     st.tuples(st.just("POST"), st.sampled_from(POSTS), st.just([]), st.one_of(st.just([]), CHANGES)),
     st.tuples(
