@@ -273,11 +273,32 @@ def test_near_zero_the_bias_is_seen() -> None:
     zero = length_of(np.array([0.03, 0.03, 0.02]), c, None, 3, BARE)
     assert zero.corrected == 0.0 and zero.bias == pytest.approx(zero.value)
     assert zero.low == 0.0
-    assert zero.uncertainty == pytest.approx(0.03 * 2.795, rel=0.01)  # 95 % of Maxwell's distribution
+    assert zero.uncertainty == pytest.approx(2 * 0.03)
+    longest = length_of(np.array([0.0, 0.0, 0.0838]), c, None, 3, BARE)  # 95 % of Maxwell's distribution is 2.795 σ
+    assert longest.uncertainty == pytest.approx(longest.value) and longest.low == 0.0
     far = length_of(np.array([1.0, 0.0, 0.0]), c, None, 3, BARE)
     assert far.k == pytest.approx(2.0, abs=0.05)
     assert far.bias == pytest.approx(0.03**2, rel=0.05)
     assert quantile_of_length(np.diag([0.09, 0.0, 0.0])) == pytest.approx(0.3 * 1.96, rel=0.01)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("length", [0.0, 0.7, 1.5, 3.0, 8.0])
+@pytest.mark.parametrize("sigmas", [(1.0, 1.0, 0.4), (1.0, 0.5, 0.3), (1.0, 0.9, 0.0)])
+def test_intervals_hold_lengths_near_zero(sigmas: tuple[float, float, float], length: float) -> None:
+    rng = np.random.default_rng(7)
+    std, axes = np.array(sigmas), int(np.count_nonzero(sigmas))
+    draws = rng.normal(size=(4000, 3)) * std
+    held, wide = [], []
+    for _ in range(1000):
+        direction = rng.normal(size=3) * (std > 0)
+        seen = length * direction / np.linalg.norm(direction) + rng.normal(size=3) * std
+        found = length_of(seen, np.diag(std**2), draws, axes, BARE)
+        held.append(found.low <= length <= found.high)
+        wide.append(found.uncertainty)
+    # Four standard deviations of a binomial distribution are 2.8 %; along the lesser axes U is of the largest.
+    assert 0.922 < np.mean(held) <= 1.0
+    assert np.mean(wide) < 2.3
 
 
 # --- poses -----------------------------------------------------------------------------------------------

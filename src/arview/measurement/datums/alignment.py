@@ -183,6 +183,9 @@ def _result(
             rows = one.rows[:, :6] - one.rows[:, 3:6] @ shift_origin(center)[:, :6]
             common = part @ (rows / np.array([reach] * 3 + [1.0] * 3))
             share = share + (options.form_mm**2 + one.form_mm**2) * common @ common.T
+            if one.by_form is not None:
+                bent = part @ one.by_form
+                share = share + one.form_mm**2 * bent @ bent.T
         rows = one.rows - one.rows[:, 3:6] @ shift_origin(origin)
         rest = one.offsets_mm - rows @ move
         if one.by_radius is not None and fit.radius_mm is not None:

@@ -25,6 +25,7 @@ from arview.measurement.datums.options import DatumOptions
 from arview.measurement.datums.plane_edges import measure_plane_by_edges
 from arview.measurement.datums.planes import inside_triangles, plane_neighbours, plane_samples
 from arview.measurement.datums.rims import Rim, find_rim
+from arview.measurement.datums.roundness import rim_shift_mm, waves
 from arview.measurement.photo.edges import edge_offsets
 from arview.measurement.photo.patches import near_edges, near_others, tangents_of
 from arview.measurement.photo.rival_edges import EdgePoints
@@ -151,7 +152,9 @@ def _measure_rim(datum: Datum, views: PhotoViews, o: DatumOptions) -> DatumEquat
         datum.label, datum.feature, points[which[steps.ok]], steps.directions, steps.offsets, steps.variances,
         len(which), steps.design[:, 3], datum.locks,
     )  # fmt: skip
-    return replace(equations, form_mm=o.rim_px * px_mm)
+    angles = (np.arange(len(points)) * 2 * np.pi / len(points))[which[steps.ok]]
+    shift_mm = rim_shift_mm(steps.design, steps.offsets, steps.variances, angles, o.rim_px * px_mm)
+    return replace(equations, form_mm=shift_mm, by_form=waves(steps.design[:, 3], angles))
 
 
 @dataclass(frozen=True)
@@ -298,4 +301,4 @@ def _measure_edge(datum: Datum, views: PhotoViews, o: DatumOptions) -> DatumEqua
         datum.label, "edge", points[which[steps.ok]], steps.directions, steps.offsets, steps.variances, len(which),
         None, datum.locks,
     )  # fmt: skip
-    return replace(equations, form_mm=o.rim_px * px_mm)
+    return replace(equations, form_mm=o.edge_px * px_mm)

@@ -19,7 +19,8 @@ class DatumOptions:
     reach_mm: float = 1.0  # largest distance of a feature from its rough place
     rim_points: int = 120  # around a hole; about one px apart on small ones
     fine_reach_px: float = 3.0  # search range around the place that the first search of a rim found
-    rim_px: float = 0.07  # standard uncertainty of a rim's position by rust, chalk and burrs beside it
+    rim_px: float = 0.04  # expected standard uncertainty of a rim's position by rust, chalk and burrs beside it
+    edge_px: float = 0.07  # standard uncertainty common to straight edges of a datum, by rust, chalk and burrs
     plane_form_mm: float = 0.02  # standard uncertainty of a plane beside all other edges of its component, by form
     rival_px: float = 3.0  # rim points with the opposite rim this near in a photo are not used there
     sweep: SweepOptions = field(default_factory=SweepOptions)

@@ -120,7 +120,7 @@ def _by_own_edges(datum: Datum, edges: EdgePoints, views: PhotoViews, o: DatumOp
     unit = np.array([radius_mm] * 3 + [1.0] * 3)
     project = (np.eye(6) - fit.undetermined.T @ fit.undetermined) / unit[:, None] * unit
     twist = project @ np.concatenate([log_so3(place[:3, :3]), place[:3, :3] @ center + place[:3, 3] - center])
-    systematic = np.diag(1.0 / unit**2) * (o.rim_px * px_mm) ** 2
+    systematic = np.diag(1.0 / unit**2) * (o.edge_px * px_mm) ** 2
     # Where the face is brighter than all around it, glare moves all its edges alike.
     covariance = fit.covariance + project @ (systematic + np.outer(dark, dark)) @ project.T
     used = int(np.count_nonzero(fit.weights > 0.1))

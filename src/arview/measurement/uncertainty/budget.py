@@ -214,9 +214,9 @@ def length_of(
 ) -> Length:
     """Length of a measured vector, with its uncertainty.
 
-    Far from zero, U is k standard uncertainties along the vector. Near zero every error increases the length; there U
-    is the length below which pure noise stays with the given probability, so that the interval covers the true length
-    with that probability whatever it is.
+    U is at least k standard uncertainties along the vector. A length that pure noise stays below with the given
+    probability is compatible with zero: there U is at least the length, so that the interval reaches zero, as a unified
+    interval does (Feldman & Cousins 1998). A longer one may be too long by the bias of noise.
 
     Args:
         vector: (3,) measured.
@@ -236,7 +236,7 @@ def length_of(
         by_noise = float(np.quantile(np.linalg.norm(deviations, axis=1), options.probability))
     uncertainty = options.k * along
     if value <= by_noise:
-        uncertainty = max(uncertainty, by_noise)
+        uncertainty = max(uncertainty, value)
     elif deviations is None:
         uncertainty += value - corrected
     else:
