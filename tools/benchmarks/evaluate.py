@@ -45,6 +45,7 @@ from recordings import (
     table,
 )
 from rows import ResultRow
+from suites.coverage import coverage_rows
 from suites.detection import DetectionSuite
 from suites.guided_init import guided_init_rows
 from suites.measurement import measurement_rows
@@ -64,7 +65,7 @@ SEED = 7
 SECTIONS = (
     "track", "converge", "guided-init", "detect", "semisynthetic-track", "semisynthetic-detect", "false-alarms",
     "lookalike", "relocalize", "sample", "reconstruct", "measure", "real-track", "real-detect", "quality",
-    "accepted", "scale", "presence", "several", "occluders",
+    "accepted", "scale", "presence", "several", "occluders", "coverage",
 )  # fmt: skip
 
 
@@ -97,6 +98,8 @@ def main() -> None:
     parser.add_argument(
         "--real-frames", type=positive, default=REAL_FRAMES, help=f"of their sequences; default: {REAL_FRAMES}"
     )
+    parser.add_argument("--sets", type=Path, help="folder of make_sets.py, for coverage; default: none")
+    parser.add_argument("--use", choices=("develop", "judge", "all"), default="develop", help="of --sets")
     parser.add_argument("--assemblies", type=positive, help="of presence: how many assemblies; default: all six")
     chosen = parser.parse_args()
     every = scenes(SEQUENCES)
@@ -130,6 +133,7 @@ def main() -> None:
         presence.rows,
         lambda: SeveralSuite(found, details, chosen.frames).rows(),
         OccluderSuite(found, details).rows,
+        lambda: coverage_rows(chosen.sets, chosen.use, chosen.folder / "coverage", details) if chosen.sets else [],
     )
     sections = dict(zip(SECTIONS, makers, strict=True))
     rows: list[ResultRow] = []
@@ -139,14 +143,19 @@ def main() -> None:
                 rows += make()
             except InputError as error:  # no photos, no recordings
                 skip(name, str(error))
+    write(rows, details, chosen.folder)
+
+
+def write(rows: list[ResultRow], details: dict[str, Any], folder: Path) -> None:
+    """Print the table, and write it and all details into a folder."""
     cells = [(x.measure, x.on, x.found, x.target, "yes" if x.is_reached else "NO") for x in rows]
     text = table(("measure", "on", "found", "must reach", "reached"), cells)
     print(text)
-    chosen.folder.mkdir(parents=True, exist_ok=True)
-    (chosen.folder / "evaluation.md").write_text(text + "\n")
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "evaluation.md").write_text(text + "\n")
     content = {"rows": [asdict(row) for row in rows], "scenes": details}
-    (chosen.folder / "evaluation.json").write_text(json.dumps(content, indent=1) + "\n")
-    print(f"\nwrote {chosen.folder / 'evaluation.json'} and evaluation.md")
+    (folder / "evaluation.json").write_text(json.dumps(content, indent=1) + "\n")
+    print(f"\nwrote {folder / 'evaluation.json'} and evaluation.md")
 
 
 def names_of(known: tuple[str, ...]) -> Callable[[str], tuple[str, ...]]:

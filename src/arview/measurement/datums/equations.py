@@ -42,8 +42,8 @@ class DatumEquations:
         locks: degrees of freedom that the datum may lock.
         directions: (6,K) directions within which it may lock, about its origin and the axes of the model; None: all.
         form_mm: additional standard uncertainty of its position that the residuals do not show.
-        by_form: (N,W) derivative of the offsets by errors of form, each of ``form_mm``; they move a feature that is seen
-            in part. None: no such errors.
+        by_form: (N,W) derivative of the offsets by errors of form, each of ``form_mm``, which move a feature that is
+            seen in part. None: no such errors.
     """
 
     label: str
