@@ -44,7 +44,7 @@ def normalised_errors(sigma_mm: float, runs: int, arc: float = 2 * np.pi) -> Arr
     return np.concatenate(found)
 
 
-@pytest.mark.parametrize(("sigma_mm", "arc"), [(0.016, 2 * np.pi), (0.022, 2 * np.pi), (0.016, 1.3 * np.pi)])
+@pytest.mark.parametrize(("sigma_mm", "arc"), [(0.016, 2 * np.pi), (0.01, 2 * np.pi), (0.016, 1.3 * np.pi)])
 @pytest.mark.slow
 def test_intervals_hold_the_position_of_rusty_rims(sigma_mm: float, arc: float) -> None:
     z = normalised_errors(sigma_mm, 200, arc)

@@ -203,10 +203,8 @@ def class_row(name: str, measured: Sequence[Measured], limits: tuple[float, floa
     text = f"{100 * share:.1f} % [{100 * low:.1f}, {100 * high:.1f}] of {len(measured)} in {sets} sets"
     text += f", mean U {uncertainty:.3f} mm; along own axes {100 * inside:.1f} % of {len(z)} within 1.96 u,"
     text += f" rms of error / u {np.sqrt(np.mean(z**2)):.2f}"
-    if name == "all":
-        is_reached = limits[0] <= share <= limits[1]
-    else:
-        is_reached = high >= limits[0] and low <= limits[1]
+    worst, best = (share, share) if name == "all" else (low, high)
+    is_reached = best >= limits[0] and worst <= limits[1]
     target = f"{100 * limits[0]:.0f}–{100 * limits[1]:.0f} %"
     return ResultRow("coverage of U", name, text, target, bool(is_reached))
 

@@ -29,9 +29,10 @@ def waves(radial: Array, angles: Array) -> Array:
 def rim_shift_mm(design: Array, offsets: Array, variances: Array, angles: Array, expected_mm: float) -> float:
     """Standard uncertainty, along each axis, of a rim's position by errors that move its edge over an arc.
 
-    The variance is the mean of the expected one and of that inferred from the rim's own harmonics: both have the weight of
-    six observations, the conjugate estimate of a variance (Gelman et al., Bayesian Data Analysis, 2.6). Six amplitudes
-    alone tell a variance only within a factor of three. A rim that is not seen all around shows too little of itself.
+    The variance is the mean of the expected one and of that inferred from the rim's own harmonics: both have the weight
+    of six observations, the conjugate estimate of a variance (Gelman et al., Bayesian Data Analysis, 2.6). Six
+    amplitudes alone tell a variance only within a factor of three. A rim that is not seen all around shows too little
+    of itself.
 
     Args:
         design: (N,4) derivative of the offsets by the shift and the radius of the rim.
