@@ -83,8 +83,9 @@ def compare(first: ComponentDeviation, second: ComponentDeviation) -> HalvesDiff
     (one, own_axes, one_seen), (other, other_axes, other_seen) = ours, theirs
     if not np.allclose(own_axes, other_axes, atol=1e-6):
         own_axes = np.eye(3)
-        one_seen, other_seen = (np.array([v is not None for v in c.displacement_mm]) for c in (first, second))
-    axes = own_axes[one_seen & other_seen]
+        one_seen = np.array([value is not None for value in first.displacement_mm])
+        other_seen = np.array([value is not None for value in second.displacement_mm])
+    axes = own_axes[np.logical_and(one_seen, other_seen)]
     if not len(axes):
         return HalvesDifference(
             first.name, uncertainties_mm=uncertainties, reason="the halves determine no common axis"
