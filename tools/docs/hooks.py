@@ -42,7 +42,7 @@ def generated_pages() -> Iterator[tuple[str, str]]:
         "# Part file\n\nA part file adds to a CAD file what it does not say. All but `cad` has a default. Keys that "
         f"are not known are an error.\n\n```toml\n{PART_FILE_EXAMPLE}```\n",
     )
-    yield "reference/inspection-json.md", schema_markdown().replace("[matrix](#matrix)", "matrix")
+    yield "reference/inspection-json.md", schema_markdown()
     yield "reference/api.md", "\n".join(api_page())
 
 

@@ -59,7 +59,7 @@ def _inner_object(value: dict[str, Any]) -> dict[str, Any] | None:
 def _type(value: dict[str, Any]) -> str:
     if "$ref" in value:
         name = value["$ref"].rsplit("/", 1)[-1]
-        return "number ≥ 0" if name == "length" else f"[{name}](#{name})"
+        return {"length": "number ≥ 0", "matrix": "matrix"}.get(name, f"[{name}](#{name})")
     if "const" in value:
         return f"`{json.dumps(value['const'])}`"
     if "enum" in value:

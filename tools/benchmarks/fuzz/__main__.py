@@ -26,7 +26,7 @@ HERE = Path(__file__).resolve().parent
 sys.path[:0] = [str(ROOT / "tests"), str(HERE)]
 
 SLICE_S = 20.0
-LEAST_SLICE_S = 3.0
+MIN_SLICE_S = 3.0
 DEADLINE_S = 900.0
 
 
@@ -86,7 +86,7 @@ def main() -> int:
     def run_one(name: str, seed: int) -> None:
         if seed > options.seed and time.monotonic() > ends_s:  # in the first round every target is run
             return
-        found = run_worker(name, seed, options.examples, max(LEAST_SLICE_S, slice_s), folder)
+        found = run_worker(name, seed, options.examples, max(MIN_SLICE_S, slice_s), folder)
         inputs[name] += found["inputs"]
         for signature, text in found["faults"]:
             if signature not in faults:
