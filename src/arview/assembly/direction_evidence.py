@@ -82,6 +82,21 @@ class DirectionEvidence:
         sums += log_odds
         return self._combined(counts, sums, is_mismatched) - before
 
+    def turned(self, model_from_model: Array, source: NDArray[np.int64]) -> DirectionEvidence:
+        """The evidence as it is in a turned pose.
+
+        Args:
+            model_from_model: (4,4) from the turned pose, on the model's side.
+            source: (C,) the component of which each has the evidence from now on; -1 for none.
+        """
+        found = DirectionEvidence(len(source), self._center_in_model, self._options)
+        found._directions = self._directions @ model_from_model[:3, :3]
+        is_known = source >= 0
+        found._counts, found._sums = (np.where(is_known, rows[:, source], 0.0) for rows in (self._counts, self._sums))
+        found.observations = np.where(is_known, self.observations[source], 0)
+        found.spreads_deg = np.where(is_known, self.spreads_deg[source], 0.0)
+        return found
+
     def _widen_spreads(self, direction: Array, is_observed: NDArray[np.bool_]) -> None:
         """Take a new observation of some components into account in their spreads."""
         angles_deg = np.rad2deg(np.arccos(np.clip(self._directions @ direction, -1.0, 1.0)))

@@ -16,9 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arview.assembly.direction_evidence import DirectionEvidence, DirectionOptions
+from arview.assembly.monitor_state import MonitorState
 from arview.assembly.observation import ComponentObserver, Known, Observation, ObservationOptions, base_of
 from arview.assembly.present_lines import PresentLines
-from arview.assembly.turned_poses import TurnedPoseOptions, TurnedPoses
+from arview.assembly.turned_poses import Turn, TurnedPoseOptions, TurnedPoses
 from arview.cad.model import Model
 from arview.camera import Camera
 from arview.geometry import Array, are_near, rigid
@@ -97,41 +98,6 @@ class MonitorOptions:
     directions: DirectionOptions = field(default_factory=DirectionOptions)
 
 
-@dataclass
-class MonitorState:
-    """State of the components of the part in view.
-
-    Attributes:
-        log_odds: (C,) summed log odds that each is not at its nominal placement.
-        directions: evidence added from each direction.
-        is_mismatched: (C,) mismatched.
-        is_missing: (C,) mismatched, and surely so.
-        is_verified: (C,) confirmed at its nominal placement.
-        was_visible: (C,) visible in the last observation.
-        was_occluded: (C,) behind something in the last observation.
-        alternative: (C,) summed log odds of "at an alternative placement".
-        shifts: (C,3) mm in the model frame to that placement.
-        last_pose: (4,4) of the last frame; None before the first.
-        has_suspects: the last observation had suspects.
-        observations: made so far.
-        frames_since: frames since the last observation.
-    """
-
-    log_odds: Array
-    directions: DirectionEvidence
-    is_mismatched: NDArray[np.bool_]
-    is_missing: NDArray[np.bool_]
-    is_verified: NDArray[np.bool_]
-    was_visible: NDArray[np.bool_]
-    was_occluded: NDArray[np.bool_]
-    alternative: Array
-    shifts: Array
-    last_pose: Array | None = None
-    has_suspects: bool = False
-    observations: int = 0
-    frames_since: int = 0
-
-
 class AssemblyMonitor:
     """Monitors whether the components of one part are where the CAD has them, for one camera.
 
@@ -201,9 +167,16 @@ class AssemblyMonitor:
         return bool(self._is_suspect().any())
 
     @property
-    def better_turn(self) -> Array | None:
-        """(4,4) from the pose, on the model's side, to one that fits clearly better; None: no other does."""
+    def better_turn(self) -> Turn | None:
+        """The turn to a pose that fits clearly better; None: no other does."""
         return self._turned.better
+
+    def turn(self, turn: Turn) -> None:
+        """Take a turned pose: what was seen of a place is known of the component that belongs there now."""
+        before = self._state
+        self.reset()
+        if before.observations:
+            self._state = before.turned(turn, self.options.carried_share)
 
     def other_poses(self, cam_from_model: Array) -> tuple[Array, ...]:
         """Poses (4,4) in which the base looks the same, and of which nothing has yet shown that they are wrong."""

@@ -115,11 +115,11 @@ class TurnedPoses:
         return base_turns(self._components, self._base, self._options)
 
     @property
-    def better(self) -> Array | None:
-        """(4,4) from the tracked pose, on the model's side, to a turned one that is clearly better; None: none is."""
+    def better(self) -> Turn | None:
+        """The turn from the tracked pose to one that is clearly better; None: none is."""
         best = int(np.argmax(self._sums)) if self._sums else 0
         is_better = bool(self._sums) and self._sums[best] > self._options.better
-        return self.turns[best].model_from_model if is_better else None
+        return self.turns[best] if is_better else None
 
     def open_turns(self, is_present: NDArray[np.bool_]) -> list[Turn]:
         """The turns that nothing has excluded.

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arview.assembly.monitor import AssemblyMonitor
+from arview.assembly.turned_poses import Turn
 from arview.cad.model import Model
 from arview.camera import Camera
 from arview.camera.undistort import FrameView
@@ -354,10 +355,13 @@ class TrackingSession:
         self._state.begin(is_confirmed)
         return estimate, "" if is_confirmed else "found, to be confirmed"
 
-    def _restart(self, image: NDArray[np.uint8], cam_from_model: Array) -> Estimate:
-        """Track from a pose on; nothing is known of the components yet."""
+    def _restart(self, image: NDArray[np.uint8], cam_from_model: Array, turn: Turn | None = None) -> Estimate:
+        """Track from a pose on; nothing is known of the components yet, unless it is the pose so far, turned."""
         self.tracker.start(image, cam_from_model)
-        self.components.reset()
+        if turn is None:
+            self.components.reset()
+        else:
+            self.components.turn(turn)
         return self.tracker.track(image)
 
     def _detect(self, image: NDArray[np.uint8], searches: list[int] | None) -> list[Detection]:
@@ -417,7 +421,7 @@ class TrackingSession:
         if has_absent and self._base.is_recheck_due(self.components.is_bare, estimate.is_restless):
             estimate = self._recheck_base(image, estimate)
         if (turn := self.components.better_turn) is not None:
-            return self._restart(image, estimate.cam_from_model @ turn), reason
+            return self._restart(image, estimate.cam_from_model @ turn.model_from_model, turn), reason
         if not s.hypotheses:
             return estimate, reason
         others = s.hypotheses.poses(estimate.cam_from_model)

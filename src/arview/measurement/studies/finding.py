@@ -31,7 +31,7 @@ METHODS = ("pairs of points", "FPFH and RANSAC")
 
 
 @dataclass(frozen=True)
-class CrowdedCloud:
+class ClutteredCloud:
     """A cloud with its truth: points (N,3) and normals (N,3) in mm, and ``model_from_scan`` (4,4), None if absent."""
 
     points: Array
@@ -86,7 +86,7 @@ def finding_study(part_path: str, is_quick: bool = False, seed: int = 0, runs: i
     return Study("finding", {"finding": (columns, rows)}, chart.draw(), tuple(summary))
 
 
-def scene_of(model: Model, has_part: bool, rng: np.random.Generator) -> CrowdedCloud:
+def scene_of(model: Model, has_part: bool, rng: np.random.Generator) -> ClutteredCloud:
     """A random cloud: one end of the part, boxes, tubes and balls around it, all in a random frame."""
     vertices, faces, _ = model.mesh
     surface = MeshSurface(vertices, faces)
@@ -105,7 +105,7 @@ def scene_of(model: Model, has_part: bool, rng: np.random.Generator) -> CrowdedC
         all_points, all_normals = np.concatenate([seen, all_points]), np.concatenate([sides, all_normals])
     all_points = all_points + rng.normal(0.0, NOISE * size, all_points.shape)
     place = rigid(exp_so3(rng.uniform(0.0, np.pi) * _unit(rng)), rng.uniform(-500.0, 500.0, 3))
-    return CrowdedCloud(apply(place, all_points), all_normals @ place[:3, :3].T, invert(place) if has_part else None)
+    return ClutteredCloud(apply(place, all_points), all_normals @ place[:3, :3].T, invert(place) if has_part else None)
 
 
 def _thing(rng: np.random.Generator, size: float, middle: Array) -> tuple[Array, Array]:
@@ -137,7 +137,7 @@ def _unit(rng: np.random.Generator) -> Array:
     return np.asarray(vector / np.linalg.norm(vector))
 
 
-def _searched(method: str, scene: CrowdedCloud, model: Model) -> tuple[Array | None, float | None]:
+def _searched(method: str, scene: ClutteredCloud, model: Model) -> tuple[Array | None, float | None]:
     """``model_from_scan`` and its score; None if the part is said not to be there."""
     if method == METHODS[0]:
         try:
@@ -148,7 +148,7 @@ def _searched(method: str, scene: CrowdedCloud, model: Model) -> tuple[Array | N
     return _by_features(scene, model)
 
 
-def _by_features(scene: CrowdedCloud, model: Model) -> tuple[Array, float]:
+def _by_features(scene: ClutteredCloud, model: Model) -> tuple[Array, float]:
     """Place by FPFH, RANSAC and ICP as in Open3D's examples."""
     o3d = load_open3d()
     methods = o3d.pipelines.registration
@@ -178,7 +178,7 @@ def _by_features(scene: CrowdedCloud, model: Model) -> tuple[Array, float]:
     return invert(np.array(finer.transformation)), float(finer.fitness)
 
 
-def _error(found: Array | None, scene: CrowdedCloud, model: Model) -> float | None:
+def _error(found: Array | None, scene: ClutteredCloud, model: Model) -> float | None:
     """Mean distance of the model's corners from where they are, in diameters; None without a place or a truth."""
     if found is None or scene.model_from_scan is None:
         return None
