@@ -51,7 +51,7 @@ def running_studio(path: Path) -> Iterator[Studio]:
     """The studio of a part or CAD file, at a free port."""
     document = StudioDocument(path)
     server = StudioServer(document, 0)
-    ready = threading.Event()
+    ready, before = threading.Event(), set(threading.enumerate())
     thread = threading.Thread(target=lambda: asyncio.run(server.serve(ready.set)), daemon=True)
     thread.start()
     assert ready.wait(20)
@@ -64,5 +64,5 @@ def running_studio(path: Path) -> Iterator[Studio]:
         thread.join(20)
         assert not thread.is_alive(), "the studio did not end"
         for one in threading.enumerate():  # native code that runs while the interpreter ends would abort it
-            if one.name in ("arview-studio-views", "arview-worker"):
-                one.join(300)
+            if one not in before and one.name in ("arview-studio-views", "arview-worker"):
+                one.join(60)
