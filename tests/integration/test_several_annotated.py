@@ -15,8 +15,9 @@ from arview.cli import main
 from arview.cli.exit_codes import ExitCode, presence_exit_code
 from arview.errors import InputError
 from arview.pose import Completeness, Presence
+from arview.tracking.several.specimens import specimen_names
 from arview.video import open_source
-from arview.workflow.specimens import load_specimens, specimen_names
+from arview.workflow.specimens import load_specimens
 from helpers import two_specimens
 from helpers.live_sample import INSPECTION, PART
 

@@ -167,6 +167,13 @@ class AssemblyMonitor:
         return bool(self._is_suspect().any())
 
     @property
+    def may_be_bare(self) -> bool:
+        """Whether most of the components may be absent: of those about which something is known no more are present."""
+        known = self._aside or self._state
+        is_other = np.arange(len(known.log_odds)) != self._observer.base
+        return int((known.is_mismatched & is_other).sum()) >= int((known.is_verified & is_other).sum())
+
+    @property
     def better_turn(self) -> Turn | None:
         """The turn to a pose that fits clearly better; None: no other does."""
         return self._turned.better

@@ -294,7 +294,8 @@ class TrackingSession:
             if estimate is not None or is_resting:
                 return estimate, reason
         if not is_resting:
-            found = self._detect_base(searched, searches) if o.use_base_detection else None
+            is_bare = o.use_base_detection and self.components.may_be_bare
+            found = self._detect_base(searched, searches) if is_bare else None
             if found is not None:
                 self._expect_base(found.cam_from_model)
                 estimate, base_reason = self._begin_detected(image, found, math.inf)
