@@ -22,6 +22,11 @@ QUICK = click.option("--quick", is_flag=True, help="Few runs with few points: se
 SEED = click.option("--seed", type=int, default=0, show_default=True, help="The same seed gives the same figures.")
 
 
+def study_options(command: Callable[..., None]) -> Callable[..., None]:
+    """The options that all studies have."""
+    return OUTPUT(QUICK(SEED(command)))
+
+
 @main.group(
     short_help="Studies of the registration, on simulated posts and clouds.",
     epilog="""\b
@@ -45,9 +50,7 @@ Examples:
   arview study displacement --quick
   arview study displacement -o studies/ --seed 1""",
 )
-@OUTPUT
-@QUICK
-@SEED
+@study_options
 def displacement(output: str, quick: bool, seed: int) -> None:
     """Two posts moved by 1 to 9 mm, 24,099 points with 0.1 mm of noise; the cost around the minimum."""
     from arview.measurement.studies import displacement_study
@@ -62,9 +65,7 @@ Examples:
   arview study noise --quick
   arview study noise -o studies/ --seed 1""",
 )
-@OUTPUT
-@QUICK
-@SEED
+@study_options
 def noise(output: str, quick: bool, seed: int) -> None:
     """Bias and spread at 0 to 0.5 mm of noise per point, with 10,000 points and 100 runs per level."""
     from arview.measurement.studies import noise_study
@@ -79,9 +80,7 @@ Examples:
   arview study rice --quick
   arview study rice -o studies/ --seed 1""",
 )
-@OUTPUT
-@QUICK
-@SEED
+@study_options
 def rice(output: str, quick: bool, seed: int) -> None:
     """10,000 measured lengths of displacements of 0 and 1 mm with 0.3 mm of noise, against Rice's distribution.
 
@@ -100,9 +99,7 @@ Examples:
   arview study density --rows bd --runs 50 --cloud-runs 5
   arview study density -o studies/ --seed 1""",
 )
-@OUTPUT
-@QUICK
-@SEED
+@study_options
 @click.option("--runs", type=click.IntRange(min=1), metavar="N", help="Runs with the exact surface.  [default: 500]")
 @click.option(
     "--cloud-runs", type=click.IntRange(min=1), metavar="N", help="Runs of ICP between clouds.  [default: 500]"
@@ -128,9 +125,7 @@ Examples:
   arview study threshold --quick
   arview study threshold -o studies/ --seed 1""",
 )
-@OUTPUT
-@QUICK
-@SEED
+@study_options
 def threshold(output: str, quick: bool, seed: int) -> None:
     """Error at a displacement of 1 mm against the threshold of the iteration: exact surface and ICP."""
     from arview.measurement.studies import threshold_study
@@ -152,9 +147,7 @@ The classical way cuts reference and measured points out around the nominal plac
 0.5 mm grid, and registers by point-to-point, then point-to-plane ICP (Open3D). With --cloud, every
 component of PART in that cloud is placed both ways instead; --truth is the truth.json of a sample.""",
 )
-@OUTPUT
-@QUICK
-@SEED
+@study_options
 @click.option("--runs", type=click.IntRange(min=1), metavar="N", help="Runs of each row.  [default: 50]")
 @click.option("--cloud", metavar="FILE", help="A cloud in any frame and format of `arview measure --cloud`.")
 @click.option("--part", metavar="PART", help="Part or CAD file of the cloud.")
@@ -180,9 +173,7 @@ Examples:
   arview study sampling --quick
   arview study sampling -o studies/ --seed 1""",
 )
-@OUTPUT
-@QUICK
-@SEED
+@study_options
 def sampling(output: str, quick: bool, seed: int) -> None:
     """Error of a post's position by number of points kept: on a grid, at random, and by their information.
 
@@ -200,9 +191,7 @@ Examples:
   arview study minima --quick
   arview study minima -o studies/ --seed 1""",
 )
-@OUTPUT
-@QUICK
-@SEED
+@study_options
 def minima(output: str, quick: bool, seed: int) -> None:
     """Share of the runs that end at the true place: round, hexagonal, stepped and grooved posts, moved by 1 to 9 mm.
 
@@ -231,9 +220,7 @@ cell to cell by more than the noise of their points allows is systematic: more p
 @click.option("--truth", metavar="JSON", help="True positions of the components; default: nominal.")
 @click.option("--cell", type=click.FloatRange(0.5, 100.0), default=5.0, show_default=True, metavar="MM",
               help="Size of a cell.")  # fmt: skip
-@OUTPUT
-@QUICK
-@SEED
+@study_options
 def bias(cloud: str, part: str, truth: str | None, cell: float, output: str, quick: bool, seed: int) -> None:
     """Mean signed error of CLOUD by place, beside the noise of its points."""
     from arview.measurement.studies import bias_study
@@ -254,9 +241,7 @@ many clouds hold these alone. The search of `arview measure --cloud` is compared
 )
 @click.option("--part", required=True, metavar="PART", help="Part or CAD file.")
 @click.option("--runs", type=click.IntRange(min=1), metavar="N", help="Clouds with the part.  [default: 6]")
-@OUTPUT
-@QUICK
-@SEED
+@study_options
 def finding(part: str, runs: int | None, output: str, quick: bool, seed: int) -> None:
     """How often a part is found, and how often refused where it is not."""
     from arview.measurement.studies import finding_study

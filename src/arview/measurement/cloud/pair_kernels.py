@@ -59,6 +59,54 @@ def hypotheses(
 
 
 @kernel
+def _moved(pose: NDArray[np.float64], point: NDArray[np.float64]) -> tuple[float, float, float]:
+    """A point (3,) moved by a pose (12,): the rotation by rows, then the translation."""
+    x, y, z = point[0], point[1], point[2]
+    return (
+        pose[0] * x + pose[1] * y + pose[2] * z + pose[9],
+        pose[3] * x + pose[4] * y + pose[5] * z + pose[10],
+        pose[6] * x + pose[7] * y + pose[8] * z + pose[11],
+    )
+
+
+@kernel
+def _nearest_node(
+    x: float, y: float, z: float, nodes: NDArray[np.int32], field: NDArray[np.float32], low: NDArray[np.float64],
+    cell: float
+) -> tuple[int, float]:  # fmt: skip
+    """Index into ``field`` of the node nearest to a place, and the signed distance there; -1 away from the surface.
+
+    The distance of the node is carried to the place along the normal. Arguments are those of `scores`.
+    """
+    u = int(np.floor((x - low[0]) / cell + 0.5))
+    v = int(np.floor((y - low[1]) / cell + 0.5))
+    w = int(np.floor((z - low[2]) / cell + 0.5))
+    if u < 0 or v < 0 or w < 0 or u >= nodes.shape[0] or v >= nodes.shape[1] or w >= nodes.shape[2]:
+        return -1, 0.0
+    node = nodes[u, v, w]
+    if node < 0:
+        return -1, 0.0
+    nx, ny, nz = field[node, 1], field[node, 2], field[node, 3]
+    return node, field[node, 0] + (
+        nx * (x - low[0] - u * cell) + ny * (y - low[1] - v * cell) + nz * (z - low[2] - w * cell)
+    )
+
+
+@kernel
+def _cosine(
+    pose: NDArray[np.float64], normal: NDArray[np.float64], node: NDArray[np.float32], is_oriented: bool
+) -> float:
+    """Cosine between a normal (3,) moved by a pose (12,) and that of a node (5,); without a sign if not oriented."""
+    a, b, c = normal[0], normal[1], normal[2]
+    cosine = (
+        node[1] * (pose[0] * a + pose[1] * b + pose[2] * c)
+        + node[2] * (pose[3] * a + pose[4] * b + pose[5] * c)
+        + node[3] * (pose[6] * a + pose[7] * b + pose[8] * c)
+    )
+    return cosine if is_oriented else abs(cosine)
+
+
+@kernel
 def scores(
     poses: NDArray[np.float64], of_pose: NDArray[np.int64], lists: NDArray[np.int64], points: NDArray[np.float64],
     normals: NDArray[np.float64], point_weights: NDArray[np.float64], nodes: NDArray[np.int32],
@@ -89,35 +137,16 @@ def scores(
             i = lists[of_pose[k], j]
             if i < 0:
                 break
-            x, y, z = points[i, 0], points[i, 1], points[i, 2]
-            mx = p[0] * x + p[1] * y + p[2] * z + p[9]
-            my = p[3] * x + p[4] * y + p[5] * z + p[10]
-            mz = p[6] * x + p[7] * y + p[8] * z + p[11]
-            u = int(np.floor((mx - low[0]) / cell + 0.5))
-            v = int(np.floor((my - low[1]) / cell + 0.5))
-            w = int(np.floor((mz - low[2]) / cell + 0.5))
-            if u < 0 or v < 0 or w < 0 or u >= nodes.shape[0] or v >= nodes.shape[1] or w >= nodes.shape[2]:
-                continue
-            node = nodes[u, v, w]
+            mx, my, mz = _moved(p, points[i])
+            node, distance = _nearest_node(mx, my, mz, nodes, field, low, cell)
             if node < 0:
                 continue
-            nx, ny, nz = field[node, 1], field[node, 2], field[node, 3]
-            distance = field[node, 0] + (
-                nx * (mx - low[0] - u * cell) + ny * (my - low[1] - v * cell) + nz * (mz - low[2] - w * cell)
-            )
             if distance < -reach:
                 total -= 0.5 * point_weights[i] * field[node, 4]
                 continue
             if distance > reach:
                 continue
-            a, b, c = normals[i, 0], normals[i, 1], normals[i, 2]
-            cosine = (
-                nx * (p[0] * a + p[1] * b + p[2] * c)
-                + ny * (p[3] * a + p[4] * b + p[5] * c)
-                + nz * (p[6] * a + p[7] * b + p[8] * c)
-            )
-            if not is_oriented:
-                cosine = abs(cosine)
+            cosine = _cosine(p, normals[i], field[node], is_oriented)
             if cosine > 0.7:
                 total += point_weights[i] * field[node, 4] * (1.0 - (distance / reach) ** 2)
         out[k] = total
@@ -146,34 +175,16 @@ def refined(
                 i = lists[of_pose[k], j]
                 if i < 0:
                     break
-                x, y, z = points[i, 0], points[i, 1], points[i, 2]
-                mx = p[0] * x + p[1] * y + p[2] * z + p[9]
-                my = p[3] * x + p[4] * y + p[5] * z + p[10]
-                mz = p[6] * x + p[7] * y + p[8] * z + p[11]
-                u = int(np.floor((mx - low[0]) / cell + 0.5))
-                v = int(np.floor((my - low[1]) / cell + 0.5))
-                w = int(np.floor((mz - low[2]) / cell + 0.5))
-                if u < 0 or v < 0 or w < 0 or u >= nodes.shape[0] or v >= nodes.shape[1] or w >= nodes.shape[2]:
-                    continue
-                node = nodes[u, v, w]
+                mx, my, mz = _moved(p, points[i])
+                node, distance = _nearest_node(mx, my, mz, nodes, field, low, cell)
                 if node < 0:
                     continue
-                nx, ny, nz = field[node, 1], field[node, 2], field[node, 3]
-                distance = field[node, 0] + (
-                    nx * (mx - low[0] - u * cell) + ny * (my - low[1] - v * cell) + nz * (mz - low[2] - w * cell)
-                )
                 if abs(distance) > reach:
                     continue
-                a, b, c = normals[i, 0], normals[i, 1], normals[i, 2]
-                cosine = (
-                    nx * (p[0] * a + p[1] * b + p[2] * c)
-                    + ny * (p[3] * a + p[4] * b + p[5] * c)
-                    + nz * (p[6] * a + p[7] * b + p[8] * c)
-                )
-                if not is_oriented:
-                    cosine = abs(cosine)
+                cosine = _cosine(p, normals[i], field[node], is_oriented)
                 if cosine < 0.5:
                     continue
+                nx, ny, nz = field[node, 1], field[node, 2], field[node, 3]
                 row[0], row[1], row[2] = my * nz - mz * ny, mz * nx - mx * nz, mx * ny - my * nx
                 row[3], row[4], row[5] = nx * size, ny * size, nz * size
                 weight = point_weights[i] * field[node, 4] * (1.0 - (distance / reach) ** 2) ** 2
