@@ -131,6 +131,7 @@ class AssemblyMonitor:
         )
         self._has_components = len(model.components) > 1
         self._observer = ComponentObserver(views, camera, model, self.options.observation)
+        self._is_base = np.arange(len(model.components)) == self._observer.base
         boxes = np.array([one.bounds_in_model for one in model.components])
         # (8 C,3) corners of the boxes of the components, and (8,3) of the part's.
         self._corners = _box_corners(boxes).reshape(-1, 3)
@@ -158,8 +159,7 @@ class AssemblyMonitor:
     def is_bare(self) -> bool:
         """Whether components were observed, and none but the base was seen at its nominal placement."""
         state = self._state
-        is_other = np.arange(len(state.log_odds)) != self._observer.base
-        return self._has_components and state.observations > 0 and not np.any(state.is_verified & is_other)
+        return self._has_components and state.observations > 0 and not np.any(state.is_verified & ~self._is_base)
 
     @property
     def has_absent(self) -> bool:
@@ -170,8 +170,7 @@ class AssemblyMonitor:
     def may_be_bare(self) -> bool:
         """Whether most of the components may be absent: of those about which something is known no more are present."""
         known = self._aside or self._state
-        is_other = np.arange(len(known.log_odds)) != self._observer.base
-        return int((known.is_mismatched & is_other).sum()) >= int((known.is_verified & is_other).sum())
+        return int((known.is_mismatched & ~self._is_base).sum()) >= int((known.is_verified & ~self._is_base).sum())
 
     @property
     def better_turn(self) -> Turn | None:
@@ -290,14 +289,17 @@ class AssemblyMonitor:
             cam_from_model: (4,4) mm pose of the present frame.
             base_part: guide views of the base alone in the frame of the part's; None: there are none.
         """
-        self._lines = self._lines or PresentLines(self._model, part, self._observer.base)
-        return self._lines.update(self._is_suspect(), self._state.is_verified, cam_from_model, base_part)
+        lines = self._lines_of(part)
+        return lines.update(self._is_suspect(), self._state.is_verified, cam_from_model, base_part)
 
     def base_lines(self, part: PartView, cam_from_model: Array, base_part: PartView | None = None) -> PartView:
         """As `present_lines` where only the base was found: the others are left out until they are seen."""
+        return self._lines_of(part).update(~self._is_base, self._is_base, cam_from_model, base_part)
+
+    def _lines_of(self, part: PartView) -> PresentLines:
+        """The lines of the part by their components, made when first needed."""
         self._lines = self._lines or PresentLines(self._model, part, self._observer.base)
-        is_base = np.arange(len(self._state.log_odds)) == self._observer.base
-        return self._lines.update(~is_base, is_base, cam_from_model, base_part)
+        return self._lines
 
     def is_same_but_turned(self, a: Array, b: Array, same_mm: float, same_deg: float) -> bool:
         """Whether two poses (4,4) are the same within bounds, or would be if the base had no other components."""

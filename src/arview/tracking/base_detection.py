@@ -35,6 +35,8 @@ class BaseDetectionOptions:
             it may have been mistaken; no component is called missing before it is found there once more.
         restless_frames: the same where the pose jumps while components are absent.
         same_share, same_deg: distance in diameters and rotation within which two poses are the same.
+        alternative_share, alternative_deg: distance in diameters and rotation from which another pose that was found is
+            an alternative.
         min_quality: probability below which a pose of the base is not accepted: bases are plainer than whole parts.
         full_every: every so many-th of the full searches of the whole part that fail is followed by one of the base.
         views: options of the base's guide views; they are fewer than those of the part, because they are made while a
@@ -47,6 +49,8 @@ class BaseDetectionOptions:
     restless_frames: int = 8
     same_share: float = 0.1
     same_deg: float = 12.0
+    alternative_share: float = 0.25
+    alternative_deg: float = 8.0
     full_every: int = 2
     views: GuideViewOptions = field(default_factory=lambda: GuideViewOptions(subdivisions=3))
 

@@ -321,8 +321,9 @@ class TrackingSession:
         if not found:
             return None
         pose = self.components.best_turned(image, found[0].cam_from_model)
-        same_mm, same_deg = 0.25 * self.views.diameter_mm, 8.0
-        others = [other for other in found[0].alternatives if not are_near(other, pose, same_mm, same_deg)]
+        o = self._base.options
+        apart_mm = o.alternative_share * self.views.diameter_mm
+        others = [other for other in found[0].alternatives if not are_near(other, pose, apart_mm, o.alternative_deg)]
         return replace(found[0], cam_from_model=pose, alternatives=tuple(others))
 
     def _expect_base(self, cam_from_model: Array) -> None:
