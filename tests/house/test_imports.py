@@ -24,6 +24,7 @@ ROOMS = (
     ("annotation",),
     ("reconstruction",),
     ("measurement",),
+    ("decisions",),
     ("report", "history", "calibration", "acceptance", "evaluation"),
     ("live",),
     ("studio",),

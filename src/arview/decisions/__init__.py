@@ -1,0 +1,31 @@
+"""Decisions by people about an inspection: an append-only log, sign-off, and what they say of the part together."""
+
+from arview.decisions.entry import Decision, decision_document
+from arview.decisions.folder import (
+    decide_component,
+    decisions_path,
+    log_of,
+    sign_inspection,
+    state_of_record,
+    tick_step,
+)
+from arview.decisions.log import DecisionLog
+from arview.decisions.record import RecordState, Signature, record_state, state_document
+from arview.decisions.table import decisions_csv
+
+__all__ = [
+    "Decision",
+    "DecisionLog",
+    "RecordState",
+    "Signature",
+    "decide_component",
+    "decision_document",
+    "decisions_csv",
+    "decisions_path",
+    "log_of",
+    "record_state",
+    "sign_inspection",
+    "state_document",
+    "state_of_record",
+    "tick_step",
+]
