@@ -26,9 +26,9 @@ ROOMS = (
     ("measurement",),
     ("decisions",),
     ("report", "history", "calibration", "acceptance", "evaluation"),
+    ("workflow",),
     ("live",),
     ("studio",),
-    ("workflow",),
     ("cli",),
 )
 """From the bottom up. A room imports only rooms of lines above its own; rooms on one line do not import each other."""
