@@ -40,7 +40,7 @@ class PoseWriter:
         if self.path.is_dir():
             raise OutputError(f"{path}: is a folder; give the name of a file")
         try:
-            self._file = self._part.open("w", encoding="utf-8")
+            self._file = self._part.open("w", buffering=1, encoding="utf-8")  # a crash cuts at most one line
         except OSError as error:
             raise self._explained(error) from error
 

@@ -82,13 +82,24 @@ def running(options: LiveOptions, load: Callable[[], Subjects], until_ready: boo
         assert not thread.is_alive(), "the server did not end"
 
 
+def paired_cookie(port: int, token: str) -> str:
+    """The cookie that a browser gets when it opens the link with the token of the run."""
+    connection = http.client.HTTPConnection(LOOPBACK, port, timeout=120)
+    connection.request("GET", f"/?token={token}")
+    answer = connection.getresponse()
+    answer.read()
+    cookie = (answer.getheader("Set-Cookie") or f"arview_{port}=").split(";")[0]
+    connection.close()
+    return cookie
+
+
 class Http:
     """Requests of a page over one connection."""
 
     def __init__(self, port: int, token: str, headers: dict[str, str] | None = None) -> None:
         self._connection = http.client.HTTPConnection(LOOPBACK, port, timeout=120)
         origin = f"http://{LOOPBACK}:{port}"
-        self.headers = {"Cookie": f"arview_{port}={token}", "Origin": origin, **(headers or {})}
+        self.headers = {"Cookie": paired_cookie(port, token), "Origin": origin, **(headers or {})}
 
     def ask(
         self, method: str, path: str, content: bytes | None = None, **headers: str

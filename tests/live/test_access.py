@@ -252,7 +252,7 @@ def test_snapshots_are_rate_limited() -> None:
 
 @pytest.mark.slow
 def test_too_many_requests_are_slowed_down() -> None:
-    chosen = options(requests=RequestLimits(per_s=5.0, burst=10.0))
+    chosen = options(requests=RequestLimits(per_s=5.0, burst=11.0))
     with running(chosen, loader(chosen)) as slow:
         page = slow.session()
         given = [page.ask("GET", "/api/status") for _ in range(30)]

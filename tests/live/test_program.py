@@ -88,7 +88,7 @@ def test_it_serves_until_ctrl_c_and_finishes_the_recording(tmp_path: Path) -> No
     assert process.returncode == 130, err
     assert "█" not in out and "▀" not in out  # no QR code without a terminal
     assert err.splitlines()[-1] == "arview: ended; files are finished" and "Traceback" not in err
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["out.jsonl", "out.mp4"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["data", "out.jsonl", "out.mp4"]
     shown = list(open_source(tmp_path / "out.mp4"))
     assert len(shown) >= 1 and shown[0].image.shape == (720, 1280, 3)
 

@@ -20,7 +20,7 @@ from arview.live.stream import station
 from arview.live.stream.frames import from_jpeg
 from arview.video import Frame, FrameSource, Image, VideoSink, open_source
 from arview.video.sources import check_source
-from helpers.live_client import Http, Running, running, wait
+from helpers.live_client import Http, Running, paired_cookie, running, wait
 from helpers.live_sample import HEIGHT, WIDTH, errors, frames, loader, options, there_and_back, truth
 
 pytestmark = pytest.mark.slow  # a camera that plays in real time
@@ -121,7 +121,7 @@ def test_screens_that_watch_get_motion_jpeg_and_only_so_many(playing: Running) -
     watching = []
     for _ in range(2):
         connection = http.client.HTTPConnection(LOOPBACK, playing.port, timeout=20)
-        connection.request("GET", "/watch.mjpg", headers={"Cookie": f"arview_{playing.port}={playing.token}"})
+        connection.request("GET", "/watch.mjpg", headers={"Cookie": paired_cookie(playing.port, playing.token)})
         answer = connection.getresponse()
         assert answer.status == 200 and "multipart/x-mixed-replace" in answer.headers["content-type"]
         watching.append((connection, answer))

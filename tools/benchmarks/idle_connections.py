@@ -23,10 +23,10 @@ ROOT = Path(__file__).resolve().parents[2]
 ADDRESS, OTHER_ADDRESS = "127.0.0.1", "127.0.0.2"
 
 
-def request(line: http.client.HTTPSConnection, port: int, token: str) -> float:
+def request(line: http.client.HTTPSConnection, cookie: str) -> float:
     """Milliseconds of a request; it must be answered."""
     began_s = time.perf_counter()
-    line.request("GET", "/api/status", headers={"Cookie": f"arview_{port}={token}"})
+    line.request("GET", "/api/status", headers={"Cookie": cookie})
     answer = line.getresponse()
     answer.read()
     if answer.status != 200:
@@ -38,20 +38,30 @@ def connection(port: int, source: str, trusting: ssl.SSLContext) -> http.client.
     return http.client.HTTPSConnection(ADDRESS, port, timeout=20, context=trusting, source_address=(source, 0))
 
 
-def measure(port: int, token: str, trusting: ssl.SSLContext, count: int) -> dict[str, list[float]]:
+def paired(port: int, token: str, trusting: ssl.SSLContext) -> str:
+    """The cookie that a browser gets for the link."""
+    line = connection(port, ADDRESS, trusting)
+    line.request("GET", f"/?token={token}")
+    answer = line.getresponse()
+    answer.read()
+    line.close()
+    return str(answer.headers["Set-Cookie"]).split(";")[0]
+
+
+def measure(port: int, cookie: str, trusting: ssl.SSLContext, count: int) -> dict[str, list[float]]:
     """Times in ms by kind of request."""
     times_ms: dict[str, list[float]] = {}
     for source, name in ((ADDRESS, "same address"), (OTHER_ADDRESS, "other address")):
         kept = connection(port, source, trusting)
-        request(kept, port, token)
+        request(kept, cookie)
         for _ in range(count):
             began_s = time.perf_counter()
             new = connection(port, source, trusting)
-            request(new, port, token)
+            request(new, cookie)
             new_ms = 1e3 * (time.perf_counter() - began_s)
             new.close()
             times_ms.setdefault(f"{name}, new connection", []).append(new_ms)
-            times_ms.setdefault(f"{name}, kept connection", []).append(request(kept, port, token))
+            times_ms.setdefault(f"{name}, kept connection", []).append(request(kept, cookie))
             time.sleep(0.05)
         kept.close()
     return times_ms
@@ -72,6 +82,7 @@ def main() -> None:
             token = re.split("token=", link)[1]
             trusting = ssl.create_default_context()
             trusting.check_hostname, trusting.verify_mode = False, ssl.CERT_NONE
+            cookie = paired(port, token, trusting)
             time.sleep(15)  # the first run of the tracker
             for idle in (0, options.idle):
                 lines = []
@@ -80,7 +91,7 @@ def main() -> None:
                     lines.append(trusting.wrap_socket(line))
                 print(f"{idle} idle TLS connections from {ADDRESS}")
                 try:
-                    for kind, times in measure(port, token, trusting, options.count).items():
+                    for kind, times in measure(port, cookie, trusting, options.count).items():
                         print(f"  {kind}: median {statistics.median(times):.1f} ms, largest {max(times):.1f} ms")
                 except (SystemExit, OSError) as error:
                     print(f"  {error}")

@@ -29,7 +29,7 @@ sys.path.insert(0, str(ROOT / "tests"))  # the tests' client
 
 from arview.live.security.addresses import LOOPBACK
 from arview.video import Image, open_source
-from helpers.live_client import Camera, Http, Phone
+from helpers.live_client import Camera, Http, Phone, paired_cookie
 from live_server import live_server
 
 FPS, WIDTH, HEIGHT = 30.0, 640, 360
@@ -58,7 +58,7 @@ class Screen:
 
     def _run(self) -> None:
         connection = http.client.HTTPConnection(LOOPBACK, self.port, timeout=20)
-        connection.request("GET", "/watch.mjpg", headers={"Cookie": f"arview_{self.port}={self.token}"})
+        connection.request("GET", "/watch.mjpg", headers={"Cookie": paired_cookie(self.port, self.token)})
         answer = connection.getresponse()
         while self.is_on:
             line = answer.readline()

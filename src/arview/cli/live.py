@@ -55,6 +55,35 @@ def _parse_size(ctx: click.Context, parameter: click.Parameter, value: str) -> t
     return int(width), int(height)
 
 
+def _list_devices(ctx: click.Context, parameter: click.Parameter, value: bool) -> None:
+    """Print the paired devices and exit."""
+    if not value or ctx.resilient_parsing:
+        return
+    from arview.live.security.devices import devices_path, read_devices
+
+    devices = read_devices(devices_path())
+    width = max((len(one.name) for one in devices), default=0)
+    for one in sorted(devices, key=lambda one: one.last_used, reverse=True):
+        click.echo(f"{one.name:{width}}  paired {one.created:%Y-%m-%d}  last used {one.last_used:%Y-%m-%d %H:%M} UTC")
+    if not devices:
+        say("no device is paired")
+    ctx.exit(0)
+
+
+def _revoke_device(ctx: click.Context, parameter: click.Parameter, value: str | None) -> None:
+    """Forget a paired device and exit."""
+    if value is None or ctx.resilient_parsing:
+        return
+    from arview.live.security.devices import Devices, devices_path
+
+    devices = Devices(devices_path())
+    if not devices.revoke(value):
+        names = ", ".join(one.name for one in devices.listed()) or "none"
+        raise InputError(f"--revoke {value}: there is no device of that name; paired are: {names}")
+    say(f"{value} is no longer paired")
+    ctx.exit(0)
+
+
 @main.command(
     short_help="Show the overlay live on a phone or screen.",
     epilog="""\b
@@ -71,7 +100,8 @@ Examples:
 Point a phone in the same network at the printed code. The first time, the phone has to be told to trust
 the station, because browsers give the camera to secure pages only; the second address that is printed
 explains how. Nothing is installed on the phone and nothing leaves the local network. The link holds a
-token that is new in each run; whoever has the link can watch.
+token that is new in each run: whoever opens it during the run is paired, and stays so in later runs.
+--devices lists the paired devices, --revoke NAME forgets one.
 
 \b
 SOURCE phone: every phone sends its own camera and has its own tracker. A camera number, an RTSP or HTTP
@@ -133,6 +163,12 @@ seconds.""",
 @click.option("--serial", metavar="TEXT", help="Serial number of the part in view; default: that of the part file.")
 @click.option("--max-age", callback=_parse_age, default="24h", show_default=True, metavar="AGE",
               help="Age from which an inspection is called old: 8h, 3d, 90min, never.")  # fmt: skip
+@click.option("--jobs", "jobs", metavar="FOLDER", default="arview_jobs", show_default=True,
+              help="Folder of the inspections that pages start; it is made with the first one.")  # fmt: skip
+@click.option("--devices", is_flag=True, is_eager=True, expose_value=False, callback=_list_devices,
+              help="List the paired phones and screens, and exit.")  # fmt: skip
+@click.option("--revoke", metavar="NAME", is_eager=True, expose_value=False, callback=_revoke_device,
+              help="Forget a paired device, of a running station too, and exit.")  # fmt: skip
 @click.option("--size", callback=_parse_size, default="1280x720", show_default=True, metavar="WxH",
               help="Size of the phone's pictures in landscape.")  # fmt: skip
 @click.option("--fps", type=float, default=30.0, show_default=True, help="Frame rate of the phone's pictures.")
@@ -159,6 +195,7 @@ def live(
     quota: float,
     serial: str | None,
     max_age: float | None,
+    jobs: str,
     size: tuple[int, int],
     fps: float,
     renderer: str,
@@ -168,14 +205,12 @@ def live(
     import asyncio
 
     require_extra()
-    from arview.cad.part_file import find_part_file
-    from arview.live.options import LiveOptions, RecordingOptions
+    from arview.live.options import JobOptions, LiveOptions, RecordingOptions
+    from arview.live.security.devices import devices_path
     from arview.live.server.live_server import LiveServer, open_endpoint
-    from arview.video.sources import check_source
 
     check_profile(profile, camera_spec)
-    for path in part_paths:
-        find_part_file(path)
+    _check_inputs(part_paths, source)
     if instances * len(part_paths) > 1:
         refuse_for_several({"--init": init, "--guideviews": views_path, "--serial": serial, "--save-profile": profile})
     if init is not None and not init.startswith("guide:"):
@@ -184,12 +219,11 @@ def live(
         raise InputError("--cert and --key belong together; give both or none")
     inputs = [*part_paths, views_path, *inspection_paths, camera_spec, source]
     record_path = _record_path(record, inputs) if record else None
-    if source != "phone":
-        check_source(source)
     options = LiveOptions(
         source=source,
         camera=camera_spec,
         profile=profile,
+        devices=devices_path(),
         inspections=tuple(Path(path) for path in inspection_paths),
         serial=serial,
         max_age_s=max_age,
@@ -197,6 +231,7 @@ def live(
         record=record_path,
         record_folder=record_path.parent if record_path else Path(),
         recording=RecordingOptions(quota_bytes=round(1e9 * quota)),
+        jobs=JobOptions(folder=Path(jobs)),
         width=size[0],
         height=size[1],
         fps=fps,
@@ -218,6 +253,17 @@ def live(
     say("ended; files are finished")
     _leave_threads()
     ctx.exit(ExitCode.INTERRUPTED)
+
+
+def _check_inputs(part_paths: tuple[str, ...], source: str) -> None:
+    """Check that the parts and the source are there, before anything takes time. Raises InputError."""
+    from arview.cad.part_file import find_part_file
+    from arview.video.sources import check_source
+
+    for path in part_paths:
+        find_part_file(path)
+    if source != "phone":
+        check_source(source)
 
 
 def _record_path(record: str, inputs: list[Any]) -> Path:

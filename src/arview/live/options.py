@@ -102,6 +102,28 @@ class WebrtcOptions:
 
 
 @dataclass(frozen=True)
+class JobOptions:
+    """Bounds on the inspections that pages start, and on what they upload."""
+
+    folder: Path = Path("arview_jobs")  # made when the first inspection is started
+    max_jobs: int = 5000  # of which the folder may hold so many
+    max_photos: int = 400  # of one inspection
+    max_open_uploads: int = 64  # begun and not complete, of one inspection
+    photo_bytes: int = 60_000_000  # size of one photo
+    photo_pixels: int = 120_000_000
+    piece_bytes: int = 1 << 20  # body of one request of an upload
+    piece_timeout_s: float = 60.0  # time in which it must arrive; a slow network is no reason to start again
+    text_bytes: int = 16_000  # bodies of the other requests: hints, decisions
+    quota_bytes: int = 200_000_000_000  # size of the folder
+    min_free_bytes: int = 500_000_000  # free disk space that is left to results and other programs
+    upload_days: float = 7.0  # an upload that is not continued for so long is dropped
+    workers: int = 1  # measurements that run at once; each uses both of two cores
+    worker_pauses_s: tuple[float, ...] = (2.0, 10.0, 60.0)  # before a measurement that broke is started again
+    worker_stop_s: float = 2.5  # time for a measurement to end in good order
+    patience_s: float = 30.0  # a measurement that only waits for photos makes room for others after so long
+
+
+@dataclass(frozen=True)
 class LiveOptions:
     """What is served to whom, and within which limits.
 
@@ -112,6 +134,7 @@ class LiveOptions:
     source: str = PHONE  # "phone": each page sends its own camera; else a source of arview.video.open_source
     camera: str | None = None  # camera of arview.camera.read.load_camera; None: guessed, and the page says so
     profile: str | None = None  # name of the profile in which an estimated camera is kept; None: it is not kept
+    devices: Path | None = None  # file of the paired devices; None: they are forgotten at the end of the run
     inspections: tuple[Path, ...] = ()  # inspection.json of the parts, in their order, read again when they change
     serial: str | None = None  # serial number of the part at the station; None: that of the part file, if any
     max_age_s: float | None = 86400.0  # age above which the page calls an inspection old; None: never
@@ -139,6 +162,7 @@ class LiveOptions:
     feed: FeedOptions = field(default_factory=FeedOptions)
     station: StationOptions = field(default_factory=StationOptions)
     recording: RecordingOptions = field(default_factory=RecordingOptions)
+    jobs: JobOptions = field(default_factory=JobOptions)
     requests: RequestLimits = field(default_factory=RequestLimits)
     webrtc: WebrtcOptions = field(default_factory=WebrtcOptions)
     connections: ConnectionLimits = field(default_factory=ConnectionLimits)

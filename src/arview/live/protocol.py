@@ -7,9 +7,10 @@ by the page for a phone and by the server for a station camera.
 
 Endpoints
 =========
-All requests need the token: ``GET /?token=…`` sets the cookie (``HttpOnly; SameSite=Strict``) and returns the page,
-which removes the token from its address (``history.replaceState``); later requests carry the cookie. POST and DELETE
-need the ``Origin`` header that browsers send. JSON is sent as ``application/json``.
+All requests need a token: ``GET /?token=…`` with the token of the run pairs the browser, unless it is paired. It sets
+the cookie (``HttpOnly; SameSite=Strict``) with a token of this device, which stays valid over restarts, and returns the
+page, which removes the token from its address (``history.replaceState``); later requests carry the cookie. POST, PATCH
+and DELETE need the ``Origin`` header that browsers send. JSON is sent as ``application/json``.
 
 ``GET /`` and ``GET /watch``
     ``page/index.html``, and ``page/watch.html`` for screens that only watch.
@@ -45,8 +46,18 @@ need the ``Origin`` header that browsers send. JSON is sent as ``application/jso
     Frame N, without ``id`` the newest, with the overlay that the server draws. The PNG's text chunk ``arview`` holds
     its data as JSON. 404 ``no_such_frame`` when the frame is no longer kept: the last 12 tracked frames and the held
     one are.
+``POST /api/clients/CLIENT/snapshots?id=N``
+    The same snapshot, kept at the station beside the recordings: 201 ``{"name"}``, 507 ``disk_full``.
+``GET /api/snapshots``, ``GET /api/snapshots/NAME``
+    ``{"snapshots": [{"name", "bytes", "created"}]}``, the newest first; and one of them, ``image/png``.
+``GET /api/recordings``
+    ``{"recordings": [{"number", "name", "bytes", "seconds" | null, "created", "is_recovered": cut off by a crash}]}``:
+    the finished recordings in the folder, those of earlier runs included.
 ``GET /api/recordings/N``
-    The video of a finished recording of this run, ``video/mp4``, as a download. Its poses stay at the station.
+    The video of one of them, ``video/mp4``, as a download. Its poses stay at the station.
+``GET /api/devices``, ``DELETE /api/devices/NAME``
+    ``{"devices": [{"name", "created", "last_used", "is_this"}]}``: the paired devices; and forget one (204), whose
+    pages stop at once.
 
 WebRTC
 ======
@@ -109,7 +120,7 @@ Status::
               "age_ms": since the newest frame arrived | null, "received_fps", "tracked_fps", "received", "dropped",
               "unreadable": frames without a readable stamp or JPEG, "width": px | null, "height": px | null} | null,
      "notices": [{"code": see NOTICE_CODES, "level": "info" | "warning" | "error", "text": one line}],
-     "recording": {"is_on": bool, "seconds": s, "finished": [N, …]},
+     "recording": {"is_on": bool, "seconds": s, "finished": [N, …] in this run},
      "clients": count, "max_clients": count}
 
 Control, every key and every key of ``style`` may be absent::
@@ -169,6 +180,7 @@ NOTICE_CODES: Final = {
     "camera_estimated": "no camera file was given: the focal length was estimated from the tracked frames",
     "frames_scaled": "the browser sends smaller pictures than it has",
     "inspection_none": "no inspection was given: ghosts have no verdicts",
+    "inspection_future": "the inspection was made in the future: a clock is wrong",
     "inspection_old": "the inspection is older than the maximum age",
     "inspection_serial": "the inspection has another serial number than the part",
     "inspection_model": "the changed inspection file belongs to another model; the last valid one is shown",

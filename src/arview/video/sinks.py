@@ -36,6 +36,9 @@ ENCODER_PARAMETERS = "bframes=0:cabac=0"
 tracking on the same cores."""
 QUEUED_FRAMES = 4
 """Frames that may wait for the encoder; 25 MB at 1080p."""
+_INDEX_IN_FRONT = {"movflags": "+faststart"}
+_FRAGMENTED = {"movflags": "+hybrid_fragmented", "frag_duration": "1000000", "flush_packets": "1"}
+"""Fragments of a second, µs, until the file is finished; then it is made an ordinary one."""
 _AUDIO_LEAD_S = 0.05
 """Sound this long before the first frame is kept, because AAC starts with a silent packet."""
 
@@ -62,6 +65,7 @@ class VideoSink:
         source: FrameSource | str | Path | None = None,
         crf: int = 20,
         preset: str = "superfast",
+        is_recoverable: bool = False,
     ) -> None:
         """Open the file.
 
@@ -73,6 +77,8 @@ class VideoSink:
             source: source or file whose sound is copied; None: no sound.
             crf: quality of x264, 0 (lossless) to 51; 18–23 is usual.
             preset: speed of x264; "veryfast" makes files about 6 % smaller in twice the time.
+            is_recoverable: write the unfinished file in fragments of a second, which can be read after a crash; the
+                index of the finished file is then at its end.
 
         Raises:
             OutputError: the name is not valid, or the folder cannot be written to.
@@ -83,6 +89,7 @@ class VideoSink:
         self._width, self._height = width, height
         rate = fps_hint if fps_hint is not None and 1.0 <= fps_hint <= 1000.0 else 30.0
         self._fps = Fraction(rate).limit_denominator(1001)
+        self._layout = _FRAGMENTED if is_recoverable else _INDEX_IN_FRONT
         self._part = unfinished_path(self.path, os.getpid())
         if self.path.suffix.lower() not in CONTAINERS:
             raise OutputError(f"{path}: the name of the video must end in {', '.join(CONTAINERS)}")
@@ -166,9 +173,7 @@ class VideoSink:
     def _opened(self, crf: int, preset: str) -> tuple[OutputContainer, VideoStream, AudioStream | None]:
         container_format = CONTAINERS[self.path.suffix.lower()]
         try:
-            container = av.open(
-                str(self._part.absolute()), "w", format=container_format, options={"movflags": "+faststart"}
-            )
+            container = av.open(str(self._part.absolute()), "w", format=container_format, options=self._layout)
             video = container.add_stream("libx264", rate=self._fps)
             video.width, video.height = self._width + self._width % 2, self._height + self._height % 2
             video.pix_fmt = "yuv420p"

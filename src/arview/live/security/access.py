@@ -1,7 +1,8 @@
-"""Access control: the token of the run, the host name, the origin of the request and its rate."""
+"""Access control: the tokens of the run and of paired devices, the host name, the origin of the request, its rate."""
 
 from __future__ import annotations
 
+import asyncio
 import hmac
 import secrets
 from collections.abc import Collection
@@ -15,6 +16,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from arview.live.protocol import COOKIE
 from arview.live.security.connections import ConnectionTable
+from arview.live.security.devices import Devices
 from arview.live.security.limits import RateLimit
 from arview.live.security.refusals import Refusal
 
@@ -37,6 +39,10 @@ NO_TOKEN_PAGE = """<!doctype html><html lang="en"><meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1"><title>arview</title>
 <h1>This link is not valid</h1>
 <p>Scan the code at the station again: arview makes a new one each time it starts.</p></html>"""
+DEVICE = "arview_device"
+"""Key of the scope of a request under which the name of its device stands."""
+COOKIE_AGE_S = 180 * 86400
+"""Lifetime of the cookie of a paired device; each time the page is opened it starts anew."""
 
 
 @dataclass(frozen=True)
@@ -47,21 +53,23 @@ class Access:
         hosts: accepted ``Host`` headers, in lower case, with the port.
         port: port of the server. It is part of the cookie's name because all ports of a host share their cookies.
         is_secure: whether the server is reached by HTTPS.
-        token: secret of this run.
+        token: secret of this run. With devices it is only good for pairing, else it is what cookies hold.
+        devices: the paired devices, each with a token of its own; None: there are none.
     """
 
     hosts: frozenset[str]
     port: int
     is_secure: bool
     token: str = field(default_factory=lambda: secrets.token_urlsafe(24), repr=False)
+    devices: Devices | None = field(default=None, repr=False)
 
     @staticmethod
-    def to(names: Collection[str], port: int, is_secure: bool) -> Access:
+    def to(names: Collection[str], port: int, is_secure: bool, devices: Devices | None = None) -> Access:
         """Access to a server that is reached by these names and addresses."""
         written = [f"[{name}]" if ":" in name else name for name in names]
         usual = 443 if is_secure else 80
         hosts = {f"{name}:{port}".lower() for name in written} | {n.lower() for n in written if port == usual}
-        return Access(frozenset(hosts), port, is_secure)
+        return Access(frozenset(hosts), port, is_secure, devices=devices)
 
     @property
     def scheme(self) -> str:
@@ -79,9 +87,14 @@ class Access:
 
     @property
     def cookie(self) -> str:
-        """Value of the ``Set-Cookie`` header that holds the token."""
+        """Value of the ``Set-Cookie`` header that holds the token of the run."""
+        return self.cookie_with(self.token)
+
+    def cookie_with(self, token: str) -> str:
+        """Value of the ``Set-Cookie`` header that holds a token."""
         secure = "; Secure" if self.is_secure else ""
-        return f"{self.cookie_name}={self.token}; Path=/; HttpOnly; SameSite=Strict{secure}"
+        age = f"; Max-Age={COOKIE_AGE_S}" if self.devices is not None else ""
+        return f"{self.cookie_name}={token}; Path=/; HttpOnly; SameSite=Strict{age}{secure}"
 
 
 class Gate:
@@ -114,7 +127,7 @@ class Gate:
         if scope["type"] != "http":
             return
         headers = Headers(scope=scope)
-        carries_token = False
+        cookie: list[str] = []
 
         async def send_with_headers(message: Message) -> None:
             if message["type"] == "http.response.start":
@@ -122,15 +135,15 @@ class Gate:
                 for name, value in HEADERS.items():
                     answer.setdefault(name, value)
                 answer.setdefault("Cache-Control", "no-store")
-                if carries_token:
-                    answer.append("Set-Cookie", self._access.cookie)
+                for value in cookie:
+                    answer.append("Set-Cookie", value)
             await send(message)
 
         address, port = scope.get("client") or ("?", 0)
         try:
             try:
                 self._check_host(headers)
-                carries_token = self._check_token(scope, headers)
+                cookie += await self._check_token(scope, headers)
             except Refusal:
                 self._stranger_rate.check(str(address))
                 raise
@@ -148,15 +161,26 @@ class Gate:
         if headers.get("host", "").lower() not in self._access.hosts:
             raise Refusal(421, "other_host", "this server does not have that name")
 
-    def _check_token(self, scope: Scope, headers: Headers) -> bool:
-        """Whether the URL itself carries a valid token, which then goes into the cookie."""
+    async def _check_token(self, scope: Scope, headers: Headers) -> list[str]:
+        """Check that a request shows a token; returns the cookie that its browser is given, if any.
+
+        A page whose URL carries the token of the run pairs its browser, unless that is paired already.
+        """
+        access, devices = self._access, self._access.devices
         is_page = scope["path"] in PAGES and scope["method"] in ("GET", "HEAD")
-        if is_page and self._access.is_token(_query_token(scope["query_string"])):
-            return True
-        cookies = cookie_parser("; ".join(headers.getlist("cookie")))
-        if not self._access.is_token(cookies.get(self._access.cookie_name, "")):
-            raise Refusal(403, "no_token", "scan the code at the station again")
-        return False
+        shown = cookie_parser("; ".join(headers.getlist("cookie"))).get(access.cookie_name, "")
+        has_link = is_page and access.is_token(_query_token(scope["query_string"]))
+        if devices is None:
+            if not has_link and not access.is_token(shown):
+                raise Refusal(403, "no_token", "scan the code at the station again")
+            return [access.cookie] if has_link else []
+        name = devices.find(shown)
+        if name is None:
+            if not has_link:
+                raise Refusal(403, "no_token", "scan the code at the station again")
+            name, shown = await asyncio.to_thread(devices.pair, headers.get("user-agent", ""))
+        scope[DEVICE] = name
+        return [access.cookie_with(shown)] if is_page else []
 
     def _check_origin(self, scope: Scope, headers: Headers) -> None:
         """Refuse requests from pages of other sites."""

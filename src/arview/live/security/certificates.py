@@ -267,11 +267,12 @@ def _save(certificate_path: Path, key_path: Path, chain: list[x509.Certificate],
     """Write both files, readable by this user only, each of them atomically."""
     from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
 
-    _write_private(key_path, key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption()))
-    _write_private(certificate_path, b"".join(one.public_bytes(Encoding.PEM) for one in chain))
+    write_private(key_path, key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption()))
+    write_private(certificate_path, b"".join(one.public_bytes(Encoding.PEM) for one in chain))
 
 
-def _write_private(path: Path, content: bytes) -> None:
+def write_private(path: Path, content: bytes) -> None:
+    """Write a file atomically that only this user can read."""
     part = path.with_name(f".{path.name}.{os.getpid()}")
     with suppress(FileNotFoundError):
         part.unlink()

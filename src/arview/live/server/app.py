@@ -15,19 +15,20 @@ from typing import Any
 from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
-from starlette.responses import FileResponse, JSONResponse, Response
+from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 from starlette.types import ASGIApp
 
 from arview.errors import InputError
 from arview.live.protocol import ANSWER_HEADER, FRAME_IDS
-from arview.live.security.access import Access, Gate
+from arview.live.security.access import DEVICE, Access, Gate
 from arview.live.security.connections import ConnectionTable
 from arview.live.security.limits import RateLimit, body, json_body
 from arview.live.security.refusals import Refusal
 from arview.live.server.annotated_png import annotated_png
 from arview.live.server.clients import Client
 from arview.live.server.hub import Hub
+from arview.live.server.station_api import StationHandlers, keep_snapshot
 from arview.live.server.workers import StuckError
 from arview.live.stream.documents import Document, pose_document
 from arview.live.stream.feed import TrackedFrame
@@ -64,7 +65,8 @@ def make_app(hub: Hub, access: Access, connections: ConnectionTable | None = Non
         Route(f"{client}/frame", handlers.take_frame, methods=["POST"]),
         Route(f"{client}/frame", handlers.give_frame),
         Route(f"{client}/snapshot.png", handlers.annotated_png),
-        Route("/api/recordings/{number:int}", handlers.recording),
+        Route(f"{client}/snapshots", handlers.keep_snapshot, methods=["POST"]),
+        *StationHandlers(hub).routes,
     ]
     handlers_of_errors = {**refusal_handlers(), HTTPException: _http_error, StuckError: _stuck}
     app = Starlette(routes=routes, exception_handlers=handlers_of_errors)
@@ -99,7 +101,8 @@ class Handlers:
         self._hub.ready()
         if self._hub.watchers >= self._hub.options.watchers:
             raise Refusal(503, "busy", f"busy: {self._hub.watchers} screens are watching")
-        return MotionJpeg(self._hub, self._hub.options)
+        device = request.scope.get(DEVICE)
+        return MotionJpeg(self._hub, self._hub.options, lambda: self._hub.is_paired(device))
 
     async def part(self, request: Request) -> Response:
         """The *Part* document."""
@@ -126,7 +129,8 @@ class Handlers:
     async def join(self, request: Request) -> Response:
         """Add a client."""
         self._joins.check(request.client.host if request.client else "?")
-        client, answer = await self._hub.join(await self._json_body(request, self._hub.options.requests.offer_bytes))
+        wanted = await self._json_body(request, self._hub.options.requests.offer_bytes)
+        client, answer = await self._hub.join(wanted, request.scope.get(DEVICE))
         described = None if answer is None else {"type": "answer", "sdp": answer}
         return _json_response({"client": client.name, "answer": described}, 201)
 
@@ -194,6 +198,16 @@ class Handlers:
 
     async def annotated_png(self, request: Request) -> Response:
         """A snapshot: the PNG of a frame with its overlay."""
+        return Response(await self._snapshot(request), media_type="image/png")
+
+    async def keep_snapshot(self, request: Request) -> Response:
+        """Keep a snapshot at the station."""
+        png = await self._snapshot(request)
+        subjects, _ = self._hub.ready()
+        name = await asyncio.to_thread(keep_snapshot, self._hub.options.record_folder, subjects.file_name, png)
+        return _json_response({"name": name}, 201)
+
+    async def _snapshot(self, request: Request) -> bytes:
         client = self._client(request)
         self._snapshots.check(client.name)
         subjects, _ = self._hub.ready()
@@ -201,16 +215,7 @@ class Handlers:
         tracked = client.feed.newest if wants_newest else client.find(_number(request, "id", FRAME_IDS))
         if tracked is None:
             raise Refusal(404, "no_such_frame", "that frame is no longer kept")
-        png = await asyncio.to_thread(annotated_png, subjects, client.annotator, tracked)
-        return Response(png, media_type="image/png")
-
-    async def recording(self, request: Request) -> Response:
-        """A finished recording."""
-        _, recordings = self._hub.ready()
-        path = recordings.path(request.path_params["number"])
-        if path is None or not path.is_file():
-            raise Refusal(404, "not_found", "there is no such recording")
-        return FileResponse(path, media_type="video/mp4", filename=path.name)
+        return await asyncio.to_thread(annotated_png, subjects, client.annotator, tracked)
 
     async def _tracked(self, client: Client, frame: DecodedFrame) -> TrackedFrame:
         """Wait until this frame has been tracked."""

@@ -34,6 +34,7 @@ class Client:
 
     Attributes:
         name: random name of the client in URLs.
+        device: name of the paired device; None where devices are not paired.
         feed, annotator: those of the phone, or those that all pages of a station camera share.
         transport: how frames and poses are transmitted.
         mode: what the page wants to receive.
@@ -45,8 +46,15 @@ class Client:
         last_status: content of the last status message that was sent, and its monotonic time.
     """
 
-    def __init__(self, feed: Feed, annotator: FrameAnnotator, transport: Transport, mode: ViewMode) -> None:
-        self.name = secrets.token_urlsafe(12)
+    def __init__(
+        self,
+        feed: Feed,
+        annotator: FrameAnnotator,
+        transport: Transport,
+        mode: ViewMode,
+        device: str | None = None,
+    ) -> None:
+        self.name, self.device = secrets.token_urlsafe(12), device
         self.feed, self.annotator, self.transport, self.mode = feed, annotator, transport, mode
         self.connection: Connection | None = None
         self.inbox: AsyncNewestSlot[TrackedFrame] = AsyncNewestSlot(asyncio.get_running_loop())

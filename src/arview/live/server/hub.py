@@ -14,6 +14,7 @@ from typing import Any
 from arview.errors import ArviewError, InputError
 from arview.live.options import LiveOptions
 from arview.live.protocol import Transport, ViewMode
+from arview.live.security.devices import Devices
 from arview.live.security.refusals import Refusal
 from arview.live.server.clients import Client, check_control, choice_of
 from arview.live.server.glb import model_glb
@@ -44,6 +45,7 @@ class Hub:
     Args:
         options: options of the server.
         addresses: addresses at which WebRTC is offered.
+        devices: the paired devices; None: there are none, and pages show the token of the run.
 
     Attributes:
         subjects, recordings: None while the parts are being loaded.
@@ -51,8 +53,8 @@ class Hub:
         watchers: number of screens that only watch.
     """
 
-    def __init__(self, options: LiveOptions, addresses: Sequence[str]) -> None:
-        self.options, self._addresses = options, addresses
+    def __init__(self, options: LiveOptions, addresses: Sequence[str], devices: Devices | None = None) -> None:
+        self.options, self._addresses, self.devices = options, addresses, devices
         self.subjects: Subjects | None = None
         self.recordings: Recordings | None = None
         self.clients: dict[str, Client] = {}
@@ -64,6 +66,7 @@ class Hub:
         self._shared: tuple[Feed, FrameAnnotator] | None = None
         self._recorded: set[Path] = set()
         self._ticker: asyncio.Task[None] | None = None
+        self._adopting: asyncio.Task[None] | None = None
         self._joining = 0
         self._leaving: set[asyncio.Future[bool]] = set()
 
@@ -72,7 +75,9 @@ class Hub:
     def begin(self, subjects: Subjects) -> None:
         """Start with the loaded parts: open the station camera and admit pages."""
         self.subjects = subjects
-        self.recordings = Recordings(self.options.record_folder, subjects.file_name, self.options.recording)
+        self.recordings = Recordings(
+            self.options.record_folder, subjects.file_name, self.options.recording, self.options.record
+        )
         if not self.options.is_phone:
             feed, annotator = Feed(subjects, "station"), FrameAnnotator(subjects)
             self._shared = feed, annotator
@@ -80,6 +85,7 @@ class Hub:
             if self.options.record is not None:
                 self.recordings.start(feed, annotator, self.options.record)
         self._ticker = asyncio.ensure_future(self._run_ticker())
+        self._adopting = asyncio.ensure_future(self._adopt())
 
     def ready(self) -> tuple[Subjects, Recordings]:
         """The parts and the recordings.
@@ -110,8 +116,12 @@ class Hub:
 
     # --- clients --------------------------------------------------------------------------------------
 
-    async def join(self, request: dict[str, Any]) -> tuple[Client, str | None]:
+    async def join(self, request: dict[str, Any], device: str | None = None) -> tuple[Client, str | None]:
         """Add a client for a *Join* request; returns it and the SDP that answers its offer, if it made one.
+
+        Args:
+            request: the request.
+            device: name of the paired device that makes it, if any.
 
         Raises:
             Refusal: the part is being loaded, too many pages take part, or the offer cannot be used.
@@ -131,7 +141,7 @@ class Hub:
         self._joining += 1
         try:
             feed, annotator = self._shared or (Feed(subjects, "phone"), FrameAnnotator(subjects))
-            client = Client(feed, annotator, transport, mode)
+            client = Client(feed, annotator, transport, mode, device)
             answer = await self._connect(client, str(sdp)) if transport == "webrtc" else None
         finally:
             self._joining -= 1
@@ -148,6 +158,17 @@ class Hub:
             return False
         logger.info("a page left (%d of %d)", len(self.clients), self.options.max_clients)
         await self._release(client)
+        return True
+
+    def is_paired(self, device: str | None) -> bool:
+        """Whether a device is paired; True where devices are not."""
+        return self.devices is None or device is None or self.devices.has(device)
+
+    async def revoke(self, device: str) -> bool:
+        """Forget a paired device, whose pages are removed; returns whether there was one of that name."""
+        if self.devices is None or not await asyncio.to_thread(self.devices.revoke, device):
+            return False
+        await self._remove_unpaired()
         return True
 
     def client(self, name: str) -> Client:
@@ -225,10 +246,11 @@ class Hub:
 
     async def close(self) -> None:
         """Remove all clients, close the station camera and finish the files."""
-        if self._ticker is not None:
-            self._ticker.cancel()
-            with suppress(asyncio.CancelledError):
-                await self._ticker
+        for task in (self._ticker, self._adopting):
+            if task is not None:
+                task.cancel()
+                with suppress(asyncio.CancelledError):
+                    await task
         # The files come first; what does not close in time is left to the end of the program.
         if self.recordings is not None:
             await self._within(in_daemon_thread(self.recordings.stop_all), 2.0 * self.options.closing_timeout_s)
@@ -307,7 +329,8 @@ class Hub:
                 now_s = time.monotonic()
                 if now_s - reloaded_s >= self.options.reload_interval_s and self.subjects is not None:
                     reloaded_s = now_s
-                    await asyncio.to_thread(self.subjects.reload)
+                    await asyncio.to_thread(self._look_up, self.subjects)
+                    await self._remove_unpaired()
                 self._replace_stuck()
                 for client in list(self.clients.values()):
                     if self._is_gone(client, now_s):
@@ -318,6 +341,29 @@ class Hub:
                 logger.warning("%s", error)
             except Exception:  # the ticker serves all pages and must not end
                 logger.exception("the regular work for all pages failed")
+
+    def _look_up(self, subjects: Subjects) -> None:
+        """Read what may have changed in files: inspections, paired devices, the room on the disk."""
+        subjects.reload()
+        if self.devices is not None:
+            self.devices.refresh()
+        if self.recordings is not None:
+            self.recordings.check_space()
+
+    async def _adopt(self) -> None:
+        """List earlier recordings, and recover those that a crash has cut off."""
+        assert self.recordings is not None
+        try:
+            await in_daemon_thread(self.recordings.adopt)
+        except OSError as error:
+            logger.warning("the folder of the recordings cannot be read (%s)", error.strerror or error)
+
+    async def _remove_unpaired(self) -> None:
+        """Remove the pages of devices that are no longer paired."""
+        for client in list(self.clients.values()):
+            if not self.is_paired(client.device):
+                logger.info("the page of %s is removed: it is no longer paired", client.device)
+                await self.leave(client.name)
 
     def _replace_stuck(self) -> None:
         """Replace threads of tracking and camera that do not come back."""

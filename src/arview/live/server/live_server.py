@@ -20,6 +20,7 @@ from arview.live.security.certificates import (
     own_certificates,
 )
 from arview.live.security.connections import ConnectionTable
+from arview.live.security.devices import Devices
 from arview.live.security.trust_page import trust_app
 from arview.live.server.app import make_app
 from arview.live.server.hub import Hub
@@ -107,7 +108,7 @@ class LiveServer:
     def __init__(self, options: LiveOptions, endpoint: Endpoint) -> None:
         self.options, self.endpoint = options, endpoint
         names = [*endpoint.addresses, *(["localhost"] if LOOPBACK in endpoint.addresses else [])]
-        self.access = Access.to(names, endpoint.port, endpoint.certificates is not None)
+        self.access = Access.to(names, endpoint.port, endpoint.certificates is not None, Devices(options.devices))
         self._stop: asyncio.Event | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
         self._is_stopped = False
@@ -119,7 +120,7 @@ class LiveServer:
 
     @property
     def link(self) -> str:
-        """URL of the page with the token of this run."""
+        """URL of the page with the token of this run, which pairs the browser that opens it."""
         return f"{self.origin}/?token={self.access.token}"
 
     def stop(self) -> None:
@@ -142,7 +143,8 @@ class LiveServer:
             self._stop.set()
         self._loop.set_default_executor(WorkerPool(self.options.workers, self.options.worker_timeout_s))
         raise_bitrates()
-        hub = Hub(self.options, [address for address in self.endpoint.addresses if address != "localhost"])
+        addresses = [address for address in self.endpoint.addresses if address != "localhost"]
+        hub = Hub(self.options, addresses, self.access.devices)
         connections, place = ConnectionTable(self.options.connections), self.endpoint
         app = make_app(hub, self.access, connections)
         servers = [UvicornServer(app, place.listener, place.certificates, connections)]
@@ -167,6 +169,8 @@ class LiveServer:
             for server in servers:
                 server.stop()
             await hub.close()
+            if self.access.devices is not None:
+                self.access.devices.save()
             tasks[-1].cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
 

@@ -12,6 +12,8 @@ from arview.live.stream.notices import Notice, without_folder
 from arview.overlay.status import age_text
 
 _State = tuple[int, int, int] | None
+CLOCK_SLACK_S = 300.0
+"""Difference of two machines' clocks that nobody is told of."""
 
 
 class InspectionFile:
@@ -66,6 +68,9 @@ class InspectionFile:
         """The notices about the inspection at this time (default: now)."""
         notices = [self._fault] if self._fault else []
         age_s = self.inspection.age_s(now or datetime.now(UTC))
+        if age_s < -CLOCK_SLACK_S:
+            text = f"measured in the future, by {_lead_text(-age_s)}: check the clocks of this machine and of the other"
+            notices.append(Notice("inspection_future", "warning", text))
         if self._max_age_s is not None and age_s > self._max_age_s:
             notices.append(Notice("inspection_old", "warning", f"measured {age_text(age_s)}: measure again"))
         measured = self.inspection.serial
@@ -83,3 +88,11 @@ class InspectionFile:
         except OSError:
             return None
         return stat.st_mtime_ns, stat.st_size, stat.st_ino
+
+
+def _lead_text(lead_s: float) -> str:
+    """How far a time lies ahead."""
+    for unit, length_s in (("d", 86400.0), ("h", 3600.0)):
+        if lead_s >= 2 * length_s:
+            return f"{lead_s / length_s:.0f} {unit}"
+    return f"{lead_s / 60.0:.0f} min"

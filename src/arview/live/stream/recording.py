@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from datetime import datetime
+from datetime import UTC, datetime
 from pathlib import Path
 
 import cv2
@@ -22,8 +22,10 @@ from arview.live.stream.annotator import FrameAnnotator
 from arview.live.stream.feed import Feed, TrackedFrame
 from arview.live.stream.newest import NewestSlot
 from arview.live.stream.notices import Notice
+from arview.live.stream.recovery import RECOVERED, duration_s, recover_recordings
 from arview.pose_file import PoseWriter
 from arview.video import Image, VideoSink
+from arview.video.sinks import CONTAINERS
 
 logger = logging.getLogger("arview.live")
 
@@ -114,7 +116,7 @@ class Recorder:
         if self._sink is None or self._poses is None:
             height, width = image.shape[:2]
             self._size, self._first_s = (width, height), tracked.arrived_s
-            self._sink = VideoSink(self.path, width, height)
+            self._sink = VideoSink(self.path, width, height, is_recoverable=True)
             self._poses = PoseWriter(self.path.with_suffix(".jsonl"), lambda index: self._camera)
         self._sink.write(_fitted(image, *self._size), tracked.arrived_s)
         self._camera = tracked.camera
@@ -153,6 +155,11 @@ class Space:
         return f"the recording has ended: {self.limit}" if self.free_bytes <= 0 else ""
 
     @property
+    def refusal(self) -> str:
+        """Why no recording can be started; empty while one can."""
+        return f"nothing can be recorded: {self.limit}" if self.free_bytes <= 0 else ""
+
+    @property
     def warning(self) -> str:
         """A warning before that; empty while there is enough room."""
         if 0 < self.free_bytes < self.low_bytes:
@@ -183,22 +190,77 @@ def free_space(folder: Path, options: RecordingOptions, paths: Sequence[Path] = 
     return Space(on_disk, "the disk is almost full", options.low_bytes)
 
 
+@dataclass(frozen=True)
+class RecordingFile:
+    """A finished recording.
+
+    Attributes:
+        number: by which the page asks for it; it stays the same during a run.
+        path: the video.
+        bytes: its size.
+        seconds: its duration; None where it cannot be read.
+        created: time of its last change, UTC.
+        is_recovered: whether it was cut off by a crash.
+    """
+
+    number: int
+    path: Path
+    bytes: int
+    seconds: float | None
+    created: datetime
+    is_recovered: bool
+
+
 class Recordings:
-    """The recordings of one run: running ones by feed, finished ones by number.
+    """The recordings of a folder: running ones by feed, finished ones, those of earlier runs included, by number.
 
     Args:
         folder: folder of the recordings that pages ask for.
         part_name: name of the part, used in the file names.
         options: when recordings end by themselves.
+        own_path: video that the program records from the start, if any.
     """
 
-    def __init__(self, folder: Path, part_name: str, options: RecordingOptions | None = None) -> None:
+    def __init__(
+        self, folder: Path, part_name: str, options: RecordingOptions | None = None, own_path: Path | None = None
+    ) -> None:
         self._folder, self._part_name, self._options = folder, part_name, options or RecordingOptions()
+        self._own_path = own_path
         self._running: dict[Feed, Recorder] = {}
-        self._finished: list[Path] = []
+        self._lock = threading.Lock()
+        self._files: list[Path] = []
+        self._finished: list[int] = []
+        self._durations: dict[tuple[Path, int], float | None] = {}
         self._fault: dict[Feed, str] = {}
         self._ended_by: dict[Feed, str] = {}
         self._checked: tuple[float, Space | None] = (0.0, None)
+
+    def adopt(self) -> None:
+        """List the recordings of earlier runs, and recover those that a crash has cut off; this takes its time."""
+        names = [] if self._own_path is None else [self._own_path.stem]
+        folders = {self._folder} | ({self._own_path.parent} if self._own_path is not None else set())
+        for folder in folders:
+            recover_recordings(folder, names, [recorder.path for recorder in self._running.values()])
+        found = [path for path in self._folder.glob("live_*") if path.suffix.lower() in CONTAINERS]
+        for name in names:
+            recovered = [path for folder in folders for path in folder.glob(f"{name}*{RECOVERED}*")]
+            found += [path for path in recovered if path.suffix in CONTAINERS]
+        for path in sorted(set(found), key=lambda one: (one.stat().st_mtime, one.name)):
+            self._number(path)
+
+    def listed(self) -> list[RecordingFile]:
+        """The finished recordings; it opens each file once, so do not call it in the event loop."""
+        files = []
+        for number, path in enumerate(tuple(self._files)):
+            with suppress(OSError):
+                stat = path.stat()
+                key = path, stat.st_mtime_ns
+                if key not in self._durations:
+                    self._durations[key] = duration_s(path)
+                created = datetime.fromtimestamp(stat.st_mtime, UTC)
+                is_recovered = RECOVERED in path.stem
+                files.append(RecordingFile(number, path, stat.st_size, self._durations[key], created, is_recovered))
+        return files
 
     def of(self, feed: Feed) -> Recorder | None:
         """The running recorder of a feed, or None."""
@@ -226,7 +288,7 @@ class Recordings:
             self._ended_by[feed] = recorder.ended_by
             logger.warning("%s", recorder.ended_by)
         if recorder.stop():
-            self._finished.append(recorder.path)
+            self._finished.append(self._number(recorder.path))
             logger.info("recorded %s", recorder.path)
         elif recorder.fault:
             self._fault[feed] = recorder.fault
@@ -250,17 +312,17 @@ class Recordings:
 
     def space(self) -> Space:
         """Room for further recordings."""
-        paths = [*self._finished, *(recorder.path for recorder in self._running.values())]
+        paths = [*self._files, *(recorder.path for recorder in self._running.values())]
         return free_space(self._folder, self._options, paths)
 
     @property
     def finished(self) -> list[int]:
-        """Numbers of the finished recordings."""
-        return list(range(len(self._finished)))
+        """Numbers of the recordings that were finished in this run."""
+        return list(self._finished)
 
     def path(self, number: int) -> Path | None:
         """File of a finished recording, or None."""
-        return self._finished[number] if 0 <= number < len(self._finished) else None
+        return self._files[number] if 0 <= number < len(self._files) else None
 
     def notices(self, feed: Feed) -> list[Notice]:
         """The notices about the recording of a feed: it failed, it ended by itself, or there is little room for it."""
@@ -270,9 +332,16 @@ class Recordings:
         notices = [Notice("recording_failed", "error", fault.replace(f"{self._folder}/", ""))] if fault else []
         if ended:
             notices.append(Notice("recording_ended", "warning", ended))
-        elif running is not None and (low := self._recent_space().warning):
-            notices.append(Notice("disk_low", "warning", low))
+        else:
+            space = self._recent_space()
+            if low := space.warning or (space.refusal if running is None else ""):
+                notices.append(Notice("disk_low", "warning", low))
         return notices
+
+    def check_space(self) -> None:
+        """Look up the room for recordings if that was some time ago, in a thread, before `notices` has to do it."""
+        if time.monotonic() - self._checked[0] > 0.5 * self._options.check_interval_s:
+            self._checked = time.monotonic(), self.space()
 
     def _recent_space(self) -> Space:
         """As `space`, looked up once in a while only: notices are made several times a second."""
@@ -281,6 +350,13 @@ class Recordings:
             space = self.space()
             self._checked = time.monotonic(), space
         return space
+
+    def _number(self, path: Path) -> int:
+        """Number of a finished recording, a new one if it has none yet."""
+        with self._lock:
+            if path not in self._files:
+                self._files.append(path)
+            return self._files.index(path)
 
     def _new_path(self) -> Path:
         name = re.sub(r"[^\w.-]+", "_", self._part_name).strip("._") or "part"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
+from collections.abc import Callable
 from contextlib import suppress
 from typing import Protocol
 
@@ -38,11 +39,12 @@ class MotionJpeg(Response):
     Args:
         hub: provides the feed.
         options: frame rate and timeouts.
+        may_watch: asked before each picture; the response ends when the device is no longer paired.
     """
 
-    def __init__(self, hub: Watchable, options: LiveOptions) -> None:
+    def __init__(self, hub: Watchable, options: LiveOptions, may_watch: Callable[[], bool] = lambda: True) -> None:
         super().__init__()
-        self._hub, self._options = hub, options
+        self._hub, self._options, self._may_watch = hub, options, may_watch
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Send pictures until the screen disconnects."""
@@ -60,7 +62,7 @@ class MotionJpeg(Response):
     async def _send_pictures(self, send: Send, disconnected: asyncio.Future[None]) -> None:
         shown: TrackedFrame | None = None
         sent_s = 0.0
-        while not disconnected.done():
+        while not disconnected.done() and self._may_watch():
             watched = self._hub.watched()
             newest = watched[0].newest if watched is not None else None
             is_due = newest is not shown or time.monotonic() - sent_s > self._options.watch_repeat_s
