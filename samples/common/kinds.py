@@ -74,6 +74,7 @@ class Kind:
         supports: boxes (size, centre) that the part lies on.
         welds: whether there are weld beads round the components.
         exposure: factor of a fixed exposure; None meters every photo.
+        put_right: components that a fitter has put back to their nominal place; all others stay as built.
     """
 
     name: str
@@ -96,6 +97,7 @@ class Kind:
     supports: tuple[tuple[tuple[float, float, float], tuple[float, float, float]], ...] = ()
     welds: bool = False
     exposure: float | None = None
+    put_right: tuple[str, ...] = ()
 
     def seat(self, component: str) -> np.ndarray:
         """``model_from_seat`` (4,4): +Z points out of the surface that the component stands on."""

@@ -26,7 +26,7 @@ def as_built(kind: Kind, seed: int, meshes) -> dict[str, dict]:
     for name in (base, *names):
         vertices, faces = meshes[name]
         centroid = volume_centroid(vertices, faces)
-        shift, lift, tilt, twist = moves.get(name, (0.0, 0.0, 0.0, 0.0))
+        shift, lift, tilt, twist = (0.0,) * 4 if name in kind.put_right else moves.get(name, (0.0,) * 4)
         toward, about = rng.uniform(0, 2 * np.pi, 2)
         turn = kind.seat(name)[:3, :3]
         rotation_deg = np.round(turn @ [tilt * np.cos(about), tilt * np.sin(about), rng.choice((-1, 1)) * twist], 6)

@@ -6,6 +6,7 @@
     generate.py set                     the three above and part.toml: a folder that can be measured
     generate.py clip --work DIR [--first A --last B]   frames of the clip into DIR; skips existing ones
     generate.py encode --work DIR       clip.mp4 of them, and clip_truth.json
+    generate.py rework                  rework/: the part with link_1 put right, in six photos round it
     generate.py as-built                as_built.ply: the mesh that is rendered, weld beads included (not shipped)
     generate.py verify [--draw DIR]     errors of the truth at the edges of the photos, px
     generate.py sfm                     pycolmap's defaults against the truth (in arview's environment)
@@ -56,10 +57,16 @@ def encode_clip(arguments: argparse.Namespace, out: Path) -> None:
     (out / "clip_truth.json").write_text(text)
 
 
+def make_rework(arguments: argparse.Namespace, out: Path) -> None:
+    import rework
+
+    rework.make(out, arguments.first, arguments.last)
+
+
 def of_the_clip(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--work", type=Path, default=Path("/tmp/plate_clip"), help="folder for the clip's frames")
     parser.add_argument("--crf", type=int, default=20, help="of the clip")
 
 
 if __name__ == "__main__":
-    photo_set.main(KIND, FOLDER, __doc__, {"clip": make_clip, "encode": encode_clip}, of_the_clip)
+    photo_set.main(KIND, FOLDER, __doc__, {"clip": make_clip, "encode": encode_clip, "rework": make_rework}, of_the_clip)
