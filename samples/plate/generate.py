@@ -69,4 +69,6 @@ def of_the_clip(parser: argparse.ArgumentParser) -> None:
 
 
 if __name__ == "__main__":
-    photo_set.main(KIND, FOLDER, __doc__, {"clip": make_clip, "encode": encode_clip, "rework": make_rework}, of_the_clip)
+    photo_set.main(
+        KIND, FOLDER, __doc__, {"clip": make_clip, "encode": encode_clip, "rework": make_rework}, of_the_clip
+    )

@@ -10,7 +10,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 
-
 def _direction(azimuth_deg: float, elevation_deg: float) -> list[float]:
     azimuth, elevation = math.radians(azimuth_deg), math.radians(elevation_deg)
     flat = math.cos(elevation)
@@ -141,7 +140,12 @@ class ToldJobs:
 def _row(job: dict[str, Any]) -> dict[str, Any]:
     found = job["inspection"]
     about = {key: job[key] for key in ("id", "part", "serial", "created", "parent")}
-    return {**about, "stage": job["state"]["stage"], "photos": len(job["photos"]), "verdict": found and found["verdict"]}
+    return {
+        **about,
+        "stage": job["state"]["stage"],
+        "photos": len(job["photos"]),
+        "verdict": found and found["verdict"],
+    }
 
 
 def _without_job(route: Any) -> None:
