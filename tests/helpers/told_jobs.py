@@ -52,8 +52,8 @@ class ToldJobs:
         """Add a job."""
         job = {
             "id": name, "part": "bracket_plate/part.toml", "part_name": "bracket_plate", "serial": "BP-1",
-            "created": "2026-11-27T06:12:00Z", "parent": None, "photos": [], "inspection": None, "rework": [], "decisions": [],
-            "signed": None, "rechecks": [], "before_after": [], "components": None,
+            "created": "2026-11-27T06:12:00Z", "parent": None, "photos": [], "inspection": None,
+            "rework": [], "decisions": [], "signed": None, "rechecks": [], "before_after": [], "components": None,
             "state": {"stage": "collecting", "text": "", "photos": 0, "placed": 0, "step": "", "done": 0, "total": 0,
                       "is_rough": False, "cloud": "waiting"},
         }  # fmt: skip
@@ -157,5 +157,5 @@ def _without_job(route: Any) -> None:
 DRAWING = (
     b'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 300 160"><rect width="300" height="160" fill="#fff"/>'
     b'<rect x="90" y="50" width="60" height="40" fill="none" stroke="#c00" stroke-width="2"/>'
-    b'<rect x="110" y="60" width="60" height="40" fill="none" stroke="#080" stroke-width="2" stroke-dasharray="5"/></svg>'
+    b'<rect x="110" y="60" width="60" height="40" fill="none" stroke="#080" stroke-dasharray="5"/></svg>'
 )
