@@ -23,6 +23,7 @@ ROOMS = (
     ("pose_file",),
     ("annotation",),
     ("reconstruction",),
+    ("capture",),
     ("measurement",),
     ("decisions",),
     ("report", "history", "calibration", "acceptance", "evaluation"),

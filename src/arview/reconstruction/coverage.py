@@ -85,18 +85,18 @@ def coverage(
     if len(names) != len(views):
         raise InputError(f"coverage: {len(names)} names for {len(views)} camera poses")
     centres = np.array([-pose[:3, :3].T @ pose[:3, 3] for _, pose in views])
-    axis = _orbit_axis(_unit(centres - model.center_in_model))
-    seen = np.array([_seen(model, camera, pose, options) for camera, pose in views])
+    axis = _orbit_axis(unit(centres - model.center_in_model))
+    seen = np.array([components_seen(model, camera, pose, options) for camera, pose in views])
     components = []
     for index, component in enumerate(model.components):
         photos = np.flatnonzero(seen[:, index])
-        directions = _unit(centres[photos] - component.bounds_in_model.mean(axis=0))
+        directions = unit(centres[photos] - component.bounds_in_model.mean(axis=0))
         components.append(
             ComponentCoverage(
                 component.name,
                 tuple(int(photo) for photo in photos),
-                _count_separated(directions, options.direction_deg),
-                _spread_deg(directions),
+                count_separated(directions, options.direction_deg),
+                spread_deg(directions),
                 _gap(directions, axis)[0],
             )
         )
@@ -105,8 +105,11 @@ def coverage(
     return Coverage(tuple(components), tuple(advice))
 
 
-def _seen(model: Model, camera: Camera, cam_from_model: Array, options: CoverageOptions) -> list[bool]:
-    """For each component, whether the photo shows enough of it."""
+def components_seen(
+    model: Model, camera: Camera, cam_from_model: Array, options: CoverageOptions | None = None
+) -> list[bool]:
+    """For each component of a model, whether a photo at a pose (4,4) shows enough of it, by a small rendering."""
+    options = options or CoverageOptions()
     scale = min(1.0, options.max_side_px / max(camera.width, camera.height))
     small = camera.scaled(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
     ids = ZBufferRenderer(model, small).render(cam_from_model).component_ids
@@ -128,11 +131,11 @@ def _advice_on_part(
     model: Model, names: Sequence[str], centres: Array, axis: Array, options: CoverageOptions
 ) -> list[str]:
     """Advice about directions from which the whole part should be photographed."""
-    directions = _unit(centres - model.center_in_model)
-    spread_deg = _spread_deg(directions)
-    if spread_deg < options.one_side_deg:
+    directions = unit(centres - model.center_in_model)
+    spread = spread_deg(directions)
+    if spread < options.one_side_deg:
         return [
-            f"all photos are taken from one side (within {spread_deg:.0f}°): depth is poorly known; walk around the "
+            f"all photos are taken from one side (within {spread:.0f}°): depth is poorly known; walk around the "
             "part, or at least a quarter of the way"
         ]
     advice = []
@@ -170,9 +173,11 @@ def _advice_on_components(
     distance_mm = float(np.median(np.linalg.norm(centres - model.center_in_model, axis=1)))
     tried = model.center_in_model + distance_mm * _sphere(options.tried_directions)
     up = np.array([0.0, 0.0, 1.0])
-    visible = np.array([_seen(model, camera, look_at(eye, model.center_in_model, up), options) for eye in tried])
-    lowest = float((_unit(centres - model.center_in_model) @ axis).min())
-    in_reach = _unit(tried - model.center_in_model) @ axis >= lowest - 0.1
+    visible = np.array(
+        [components_seen(model, camera, look_at(eye, model.center_in_model, up), options) for eye in tried]
+    )
+    lowest = float((unit(centres - model.center_in_model) @ axis).min())
+    in_reach = unit(tried - model.center_in_model) @ axis >= lowest - 0.1
 
     advice = []
     for index in poor:
@@ -186,11 +191,11 @@ def _advice_on_components(
         if not where.any():
             advice.append(f"{state}; other components hide it from every side, so it cannot be measured in photos")
             continue
-        candidates = _unit(tried[where] - middle)
-        taken = _unit(centres[list(covered.photos)] - middle)
+        candidates = unit(tried[where] - middle)
+        taken = unit(centres[list(covered.photos)] - middle)
         nearest = (candidates @ taken.T).max(axis=1) if len(taken) else -(candidates @ axis)
         missing = max(options.photos_wanted - len(covered.photos), options.directions_wanted - covered.directions)
-        side = _named(_unit(tried[where][np.argmin(nearest)] - model.center_in_model))
+        side = _named(unit(tried[where][np.argmin(nearest)] - model.center_in_model))
         advice.append(f"{state}; take {missing} more of it, for example from the side {side}")
     return advice
 
@@ -207,12 +212,12 @@ def _orbit_axis(directions: Array) -> Array:
     """The axis about which the photos were taken: normal of their best plane, on their side of the part."""
     mean = directions.mean(axis=0)
     if len(directions) < 3:
-        return _unit(mean)
+        return unit(mean)
     axis = np.linalg.svd(directions - mean)[2][2]
     return np.asarray(axis if axis @ mean >= 0 else -axis)
 
 
-def _count_separated(directions: Array, apart_deg: float) -> int:
+def count_separated(directions: Array, apart_deg: float) -> int:
     """Number of directions (N,3) left when those within an angle of one already kept are dropped."""
     kept: list[Array] = []
     for direction in directions:
@@ -221,7 +226,7 @@ def _count_separated(directions: Array, apart_deg: float) -> int:
     return len(kept)
 
 
-def _spread_deg(directions: Array) -> float:
+def spread_deg(directions: Array) -> float:
     """Largest angle between two directions (N,3)."""
     if len(directions) < 2:
         return 0.0
@@ -230,7 +235,7 @@ def _spread_deg(directions: Array) -> float:
 
 def _gap(directions: Array, axis: Array) -> tuple[float, Array]:
     """Largest range of azimuth about ``axis`` without a direction, in degrees, and the unit vector to its middle."""
-    across = _unit(np.cross(axis, [1.0, 0.0, 0.0] if abs(axis[0]) < 0.9 else [0.0, 1.0, 0.0]))
+    across = unit(np.cross(axis, [1.0, 0.0, 0.0] if abs(axis[0]) < 0.9 else [0.0, 1.0, 0.0]))
     up = np.cross(axis, across)
     off_axis = directions[np.linalg.norm(np.cross(directions, axis), axis=1) > math.sin(math.radians(5.0))]
     if len(off_axis) == 0:
@@ -254,5 +259,6 @@ def _count(number: int, noun: str) -> str:
     return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
-def _unit(vectors: Array) -> Array:
+def unit(vectors: Array) -> Array:
+    """Vectors (...,3) of length 1 in the same directions."""
     return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12))

@@ -9,16 +9,14 @@ from numpy.typing import NDArray
 
 from arview.cad.check import GUESSED_CAMERA
 from arview.cad.part import Part
-from arview.cad.tolerance_check import ToleranceCheckOptions
 from arview.camera import Camera
+from arview.capture.dome import asked_elevation_deg, component_points, fitting_distance_mm
+from arview.capture.information import expanded_uncertainty, focal_px, prior_information, view_information
+from arview.capture.options import CaptureOptions
 from arview.errors import InputError
 from arview.geometry import Array, look_at
-from arview.rendering.renderers import ZBufferRenderer
+from arview.reconstruction.coverage import components_seen, spread_deg, unit
 
-MIN_VISIBLE_PX = 60
-"""Pixels of a component, in the small pictures of the plan, from which a photo counts as one that shows it."""
-PLAN_WIDTH_PX = 480
-"""Width of those pictures."""
 MIN_PHOTOS_OF_COMPONENT = 4
 """Photos that must show a component for a place with a small U."""
 
@@ -26,9 +24,7 @@ MIN_PHOTOS_OF_COMPONENT = 4
 def photo_plan(part: Part, count: int, camera: Camera | None = None) -> dict[str, Any]:
     """A plan of photos: two rings at two elevations of the declared range, evenly spread in azimuth.
 
-    The expected U is that of `arview check`: a share of a pixel at the photo's distance, larger where few photos or a
-    narrow spread of directions show a component (the error of a triangulated point falls with the square root of the
-    photos and with the sine of the angle between them).
+    The expected U is that of guided capture, see `arview.capture.information`.
 
     Args:
         part: as it is set up.
@@ -42,84 +38,46 @@ def photo_plan(part: Part, count: int, camera: Camera | None = None) -> dict[str
         raise InputError(f"count: {count} photos, expected 4 to 96")
     camera = camera or GUESSED_CAMERA
     model, view_range = part.model, part.effective_view_range.for_camera(camera, part.model.diameter_mm)
-    distance_mm = max(view_range.distance_mm[0], min(view_range.distance_mm[1], _fitting_mm(camera, model.diameter_mm)))
-    eyes = []
-    places = []
-    for azimuth, elevation in _ring_angles(part, count):
-        direction = view_range.direction(azimuth, elevation)
-        eyes.append(model.center_in_model + distance_mm * direction)
-        places.append({"azimuth_deg": azimuth, "elevation_deg": elevation, "direction": direction.tolist()})
-    scale = PLAN_WIDTH_PX / camera.width
-    small = camera.scaled(PLAN_WIDTH_PX, max(1, round(camera.height * scale)))
-    renderer = ZBufferRenderer(model, small)
+    fitting_mm = fitting_distance_mm(camera, model.diameter_mm)
+    distance_mm = max(view_range.distance_mm[0], min(view_range.distance_mm[1], fitting_mm))
+    angles = _ring_angles(part, count)
+    directions = np.array([view_range.direction(azimuth, elevation) for azimuth, elevation in angles])
+    eyes = model.center_in_model + distance_mm * directions
     up = view_range.up_in_model
-    seen = np.zeros((count, len(model.components)), dtype=bool)
-    for index, eye in enumerate(eyes):
-        ids = renderer.render(look_at(eye, model.center_in_model, up)).component_ids
-        pixels = np.bincount(ids[ids >= 0], minlength=len(model.components))
-        seen[index] = pixels >= MIN_VISIBLE_PX
-    options = ToleranceCheckOptions()
-    mm_per_px = distance_mm / camera.fx
+    seen = np.array([components_seen(model, camera, look_at(eye, model.center_in_model, up)) for eye in eyes])
+    points = component_points(part)
+    views = [view_information(points, row, eye, focal_px(camera)) for row, eye in zip(seen, eyes, strict=True)]
+    expected_mm = expanded_uncertainty(prior_information(len(points)) + np.sum(views, axis=0))
     return {
         "distance_mm": distance_mm,
-        "photos": places,
+        "photos": [
+            {"azimuth_deg": azimuth, "elevation_deg": elevation, "direction": direction.tolist()}
+            for (azimuth, elevation), direction in zip(angles, directions, strict=True)
+        ],
         "components": [
-            _component_row(
-                component.name,
-                np.flatnonzero(seen[:, index]).astype(np.int64),
-                eyes,
-                component.centroid_in_model,
-                count,
-            )
-            | {"expected_U_mm": _expected_u_mm(seen[:, index], eyes, component.centroid_in_model, mm_per_px, options)}
+            _component_row(component.name, np.flatnonzero(seen[:, index]), eyes - points[index], count)
+            | {"expected_U_mm": float(expected_mm[index]) if seen[:, index].sum() >= 2 else None}
             for index, component in enumerate(model.components)
         ],
     }
 
 
-def _fitting_mm(camera: Camera, diameter_mm: float) -> float:
-    """Distance at which a part spans nine tenths of the picture's smaller side."""
-    return camera.fx * diameter_mm / (0.9 * min(camera.width, camera.height))
-
-
 def _ring_angles(part: Part, count: int) -> list[tuple[float, float]]:
     """Azimuth and elevation of each photo: alternately on a lower and an upper ring."""
     view_range = part.effective_view_range
-    low, high = view_range.elevation_deg
-    low, high = max(low, 15.0) if high > 15.0 else low, min(high, 75.0) if low < 75.0 else high
+    low, high = asked_elevation_deg(view_range, CaptureOptions().elevation_deg)
     rings = (low + 0.3 * (high - low), low + 0.75 * (high - low))
     start, end = view_range.azimuth_deg
     step = min(end - start, 360.0) / count
     return [(start + (index + 0.5) * step, rings[index % 2]) for index in range(count)]
 
 
-def _component_row(name: str, photos: NDArray[np.int64], eyes: list[Array], place: Array, count: int) -> dict[str, Any]:
+def _component_row(name: str, photos: NDArray[np.int64], rays: Array, count: int) -> dict[str, Any]:
+    """A component, the photos that show it and how far these are apart, by the rays (N,3) to all photos."""
     few = len(photos) < MIN_PHOTOS_OF_COMPONENT
     return {
         "name": name,
         "photos": photos.tolist(),
-        "spread_deg": _spread_deg([eyes[index] for index in photos], place),
+        "spread_deg": spread_deg(unit(rays[photos])),
         "remark": f"seen in {len(photos)} of {count} photos only: take some from where it is not hidden" if few else "",
     }
-
-
-def _spread_deg(eyes: list[Array], place: Array) -> float:
-    """Largest angle between the directions from a place to some cameras."""
-    if len(eyes) < 2:
-        return 0.0
-    rays = np.stack(eyes) - place
-    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    return float(np.rad2deg(np.arccos(np.clip((rays @ rays.T).min(), -1.0, 1.0))))
-
-
-def _expected_u_mm(
-    is_seen: Array, eyes: list[Array], place: Array, mm_per_px: float, options: ToleranceCheckOptions
-) -> float | None:
-    """U to be expected of a component's place; None where too few photos show it."""
-    photos = np.flatnonzero(is_seen)
-    if len(photos) < 2:
-        return None
-    spread = np.deg2rad(min(_spread_deg([eyes[index] for index in photos], place), 90.0))
-    if spread < 1e-3:
-        return None
-    return float(options.expected_u_px * mm_per_px * np.sqrt(max(24.0 / len(photos), 0.25)) / np.sin(spread))
