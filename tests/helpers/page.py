@@ -28,6 +28,10 @@ def opened(chromium: Any, server: Running, script: str = "", viewport: dict[str,
     try:
         page.goto(f"http://127.0.0.1:{server.port}/?token={server.token}")
         yield page
+    except AssertionError as error:
+        if troubles:  # the cause, rather than what did not happen because of it
+            raise AssertionError(f"{error}; the page reported {troubles}") from error
+        raise
     finally:
         context.close()
     assert not troubles

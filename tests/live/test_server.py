@@ -123,7 +123,10 @@ def test_control_changes_state_and_an_invalid_request_changes_nothing(page: Http
         {"mode": "sideways"}, {"mode": 3}, {"style": {"opacity": 7}}, {"style": {"opacity": True}}, {"unknown": 1},
         {"style": {"edges": "x"}}, {"style": {"only": "no_such"}}, {"style": []}, {"style": {"ghost": None}},
         {"confirm": 1}, {"hold": -1}, {"hold": True}, {"hold": 1 << 20}, {"record": "yes"},
-        {"mode": "poses", "style": {"ghost": "yes"}},
+        {"mode": "poses", "style": {"ghost": "yes"}}, {"screen": {"width": 390, "height": 220}}, {"screen": []},
+        {"screen": {"width": 390.5, "height": 220, "density": 2}},
+        {"screen": {"width": 390, "height": 9, "density": 2}},
+        {"screen": {"width": 390, "height": 220, "density": True}},
     ):  # fmt: skip
         status, refused = page.json("POST", path, wrong)
         assert (status, refused["error"]) == (400, "bad_control"), wrong

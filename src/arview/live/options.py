@@ -21,7 +21,7 @@ class FeedOptions:
     max_lost: int = 4  # threads given up; then the stream ends, with a notice
     draw_timeout_s: float = 10.0  # a picture that is drawn for longer is given up, and others are drawn without it
     kept_frames: int = 12  # tracked frames kept for snapshots while the network is slow; 33 MB at 720p
-    kept_styles: int = 4  # overlay styles that keep a renderer and their last picture: pages, recording and screens
+    kept_styles: int = 6  # overlay styles that keep a renderer and their last picture: pages, recording and screens
     rate_window_s: float = 2.0  # window over which frame rates are counted
     silence_s: float = 1.5  # a feed without a frame for longer than this is waiting
     max_unreadable: int = 15  # consecutive frames without a readable stamp, half a second, that raise a notice

@@ -132,6 +132,8 @@ Control, every key and every key of ``style`` may be absent::
      "reset": true | id,          search again for all parts, or for one
      "confirm": true | id,        the part in view is the one to which the labels belong: see withheld of *Pose*; true
                                   where there is one part only
+     "screen": {"width", "height": px of the screen that the picture fills, "density": px for each CSS px} | null,
+                                  annotated video is made no larger, with labels that can be read there
      "hold": frame id | null,     keep this frame for a snapshot; 404 no_such_frame when it is no longer kept
      "record": bool}
 

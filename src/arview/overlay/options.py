@@ -54,6 +54,7 @@ class OverlayOptions:
         decimals: of the numbers on labels, 0–4.
         arrow_scale: exaggeration of displacements; None: chosen from the largest one.
         max_labels: more would hide the part; failures come first, and those without a label are marked by an arrow.
+        text_px: size of the text on labels; None: in proportion to the height of the picture.
         max_age_days: labels of an older inspection are dimmed and tell its age; None: of any age.
 
     Raises:
@@ -73,6 +74,7 @@ class OverlayOptions:
     decimals: int = 2
     arrow_scale: float | None = None
     max_labels: int = 12
+    text_px: int | None = None
     max_age_days: float | None = None
 
     def __post_init__(self) -> None:

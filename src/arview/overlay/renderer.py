@@ -114,7 +114,7 @@ class OverlayRenderer:
         self._centers_in_model = np.stack([one.bounds_in_model.mean(axis=0) for one in model.components])
         self._line_px = max(1.0, 0.7 + camera.height / 800)
         self._guide = GuideOutline(self._ghost, self._edges, self._line_px)
-        self._size_px = labels.text_size_px(camera.height)
+        self._size_px = self.options.text_px or labels.text_size_px(camera.height)
         self._arrow_scale = labels.arrow_scale(inspection, model.diameter_mm, self.options) if inspection else 1.0
         self._names = tuple(component.name for component in model.components)
         self._deviations = [inspection.find(name) if inspection else None for name in self._names]

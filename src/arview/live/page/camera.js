@@ -1,14 +1,13 @@
 // The camera of the phone: its frames as they arrive, and messages about its failures.
 
+import { t } from "./texts/texts.js";
+
+/** Texts for the errors of getUserMedia. */
 const MESSAGES = {
-  NotAllowedError: "The browser may not use the camera. Allow it for this page (at the lock beside the address), then try again.",
-  SecurityError: "The browser may not use the camera. Allow it for this page (at the lock beside the address), then try again.",
-  NotFoundError: "This device has no camera that the browser can use.",
-  NotReadableError: "The camera is in use by another app. Close that app, then try again.",
-  AbortError: "The camera did not start. Try again.",
-  OverconstrainedError: "The camera does not support this picture size or frame rate.",
+  NotAllowedError: "camera.denied", SecurityError: "camera.denied", NotFoundError: "camera.none", NotReadableError: "camera.in_use",
+  AbortError: "camera.aborted", OverconstrainedError: "camera.size",
 };
-const INSECURE = "Browsers allow the camera on secure pages only. Open the https address that the station shows and trust it once.";
+const DEVICE_KEY = "arview-camera"; // the camera that was chosen last
 
 export class Camera {
   #stream = null;
@@ -28,31 +27,48 @@ export class Camera {
   }
 
   /** Start the rear camera, or another one; returns whether it delivers pictures. */
-  async start({ width, height, fps }) {
+  async start(wanted) {
+    const { width, height, fps } = (this.wanted = wanted), device = localStorage.getItem(DEVICE_KEY);
     this.stop();
     if (!navigator.mediaDevices?.getUserMedia) {
-      this.onTrouble(window.isSecureContext ? MESSAGES.NotFoundError : INSECURE);
+      this.onTrouble(t(window.isSecureContext ? "camera.none" : "camera.insecure"));
       return false;
     }
     try {
       const video = {
-        facingMode: { ideal: "environment" }, width: { ideal: width }, height: { ideal: height },
+        ...(device ? { deviceId: { exact: device } } : { facingMode: { ideal: "environment" } }), width: { ideal: width }, height: { ideal: height },
         frameRate: { ideal: fps, max: Math.max(fps, 30) },
       };
       this.#stream = await navigator.mediaDevices.getUserMedia({ audio: false, video });
     } catch (error) {
-      this.onTrouble(MESSAGES[error.name] ?? `The camera did not start: ${error.message}`);
+      if (device && ["OverconstrainedError", "NotFoundError"].includes(error.name)) {
+        localStorage.removeItem(DEVICE_KEY); // the chosen camera is gone
+        return this.start(wanted);
+      }
+      this.onTrouble(error.name in MESSAGES ? t(MESSAGES[error.name]) : t("camera.failed", { reason: error.message }));
       return false;
     }
     const [track] = this.#stream.getVideoTracks();
-    track.addEventListener("ended", () => this.#lose("The camera was disconnected. Try again."));
-    track.addEventListener("mute", () => this.onTrouble("This device has paused the camera."));
+    track.addEventListener("ended", () => this.#lose(t("camera.unplugged")));
+    track.addEventListener("mute", () => this.onTrouble(t("camera.paused")));
     track.addEventListener("unmute", () => this.onTrouble(""));
     this.video.srcObject = this.#stream;
     await this.video.play().catch(() => {});
     this.onTrouble("");
+    this.onStart?.();
     this.#stopWatching = watchFrames(this.video, (moment) => this.onFrame(this.video, moment));
     return true;
+  }
+
+  /** The video track of the running camera, or null. */
+  get track() {
+    return this.#stream?.getVideoTracks()[0] ?? null;
+  }
+
+  /** Use another camera, by its deviceId; the choice is kept. */
+  choose(device) {
+    localStorage.setItem(DEVICE_KEY, device);
+    return this.start(this.wanted);
   }
 
   stop() {

@@ -1,46 +1,74 @@
 // The page: connects camera, connection, picture and controls.
 
 import { Camera, quarterTurns } from "./camera.js";
+import { CameraControls } from "./settings/camera_controls.js";
 import { Connection } from "./transport/connection.js";
+import { connectKeys } from "./keys.js";
+import { Files } from "./lists/files.js";
+import { allNotices, blocking, retryText } from "./faults.js";
+import { askSerial } from "./serial.js";
+import { clock, t, translate } from "./texts/texts.js";
+import { connectLook } from "./settings/look.js";
 import { icon } from "./icons.js";
+import { keepSnapshot } from "./lists/snapshots.js";
 import { PartLists, tally } from "./parts.js";
 import { Player } from "./player.js";
 import { Specimens, reasonOf, summaryOf } from "./specimens.js";
+import { Sheet } from "./sheet.js";
 import { Stage } from "./scene/stage.js";
 import { partsOf } from "./transport/api.js";
 import { Message, Notices, StatusBar, Toast } from "./status.js";
+import { save, share } from "./lists/share.js";
+import { ZoomControls } from "./scene/zoom_controls.js";
 
-const FIGURES_EVERY_MS = 500, STYLE_DELAY_MS = 150;
+const FIGURES_EVERY_MS = 500, STYLE_DELAY_MS = 150, SCREEN_STEP_PX = 16, MAX_DENSITY = 2;
+const SILENT_MS = 3000; // the server sends a status every second: after this its figures are old
 const find = (id) => document.getElementById(id);
 
 history.replaceState(null, "", location.pathname); // the token stays out of bookmarks and shared links
+translate();
 for (const sign of document.querySelectorAll("[data-icon]")) sign.append(icon(sign.dataset.icon));
 
 const style = { ghost: true, edges: "visible", labels: true, opacity: 0.42, only: null, only_part: 0, status: false };
-const state = { phase: { name: "loading", text: "" }, part: null, status: null, trouble: "", latencies: [], isRecording: false };
+const state = { phase: { name: "loading", text: "" }, part: null, status: null, trouble: "", latencies: [], isRecording: false, heardMs: null };
+const listeners = new Map(); // what other parts of the page wait for: see host
+const tell = (name, about) => listeners.get(name)?.forEach((act) => act(about));
 
 let player = null, isDrawAsked = false;
 
 const bar = new StatusBar({
   icon: find("state-icon"), word: find("state-name"), why: find("state-why"), quality: find("quality"),
-  meter: find("quality-meter"), latency: find("latency"), age: find("age"), body: document.body,
+  meter: find("quality-meter"), latency: find("latency"), age: find("age"), stale: find("figures-stale"), body: document.body,
 });
 const notices = new Notices(find("notices")), message = new Message(find("message")), toast = new Toast(find("toast"));
 const parts = new PartLists(find("panels"), find("card"), isolate);
 const specimens = new Specimens({ list: find("specimens"), confirms: find("confirms"), confirm: find("confirm") }, confirmPart);
 const stage = new Stage({
   stage: find("stage"), canvas: find("picture"), leaders: find("leaders"), labels: find("labels"),
-  obstacles: [find("bar"), find("notices"), find("actions"), find("card"), find("side")],
-}, style, isolate, () => requestDraw());
+  obstacles: [find("bar"), find("notices"), find("actions"), find("card"), find("side")], controls: find("zoom"),
+}, style, isolate, () => {
+  requestDraw();
+  zoom.show();
+  tellScreen();
+});
+const zoom = new ZoomControls(find("zoom"), stage);
+const files = new Files(find("file-lists"), (text) => toast.show(text));
+const sheet = new Sheet(find("side"), (section) => {
+  if (section === "files") files.refresh();
+  stage.measure();
+});
 const camera = new Camera(find("camera"), takeCameraFrame, (trouble) => {
   state.trouble = trouble;
   refresh();
 });
+const cameraControls = new CameraControls(find("camera-controls"), camera, (text) => toast.show(text));
+camera.onStart = () => cameraControls.refresh();
 const connection = new Connection(find("remote"), {
   onPhase(phase) {
     state.phase = phase;
     if (phase.name !== "connected") player?.reset();
     refresh();
+    tell("phase", phase);
   },
   onPart(part) {
     state.part = part;
@@ -50,18 +78,13 @@ const connection = new Connection(find("remote"), {
     document.title = `${titleOf(all)} · arview`;
     parts.setParts(all);
     specimens.setParts(all);
-    find("open-parts").querySelector(".badge")?.remove();
-    const bad = tally(all.flatMap((one) => one.components)).find((one) => one.classList.contains("fail") || one.classList.contains("undecided"));
-    if (bad) {
-      const badge = document.createElement("span");
-      badge.className = `badge ${bad.classList[1]}`;
-      badge.append(icon(bad.classList[1]), bad.textContent.split(" ")[0]);
-      find("open-parts").append(badge);
-    }
+    showBadge(all.flatMap((one) => one.components));
     stage.setPart(part);
+    stage.isFollowing = part.source === "station";
     if (style.only && !all[style.only_part]?.components.some((one) => one.name === style.only)) isolate(null);
     if (part.source === "phone" && !camera.isOn && !state.trouble) camera.start(part.wanted);
     requestDraw();
+    tell("part", part);
   },
   async onModels(buffers, part) {
     await stage.setModels(buffers, part);
@@ -69,20 +92,27 @@ const connection = new Connection(find("remote"), {
   onOpen() {
     player.mode = connection.mode;
     sendStyle();
-    if (connection.hasFallenBack) toast.show("This network blocks WebRTC: pictures are sent one by one");
+    sentScreen = "";
+    tellScreen();
+    if (connection.fallback) toast.show(t(`link.${connection.fallback}`));
   },
   onPose(pose) {
-    player.takePose(pose, performance.now());
+    state.heardMs = performance.now();
+    player.takePose(pose, state.heardMs);
     requestDraw();
+    tell("pose", pose);
   },
   onStatus(status) {
     const before = state.status?.recording.finished ?? status.recording.finished;
     state.status = status;
+    state.heardMs = performance.now();
     if (status.mode) player.mode = status.mode;
     const finished = status.recording.finished.filter((number) => !before.includes(number));
     if (finished.length && state.isRecording) offerRecording(finished.at(-1));
     if (!status.recording.is_on && finished.length) state.isRecording = false;
     refresh();
+    tellScreen();
+    tell("status", status);
   },
   onFrame(source, width, height, id, moment) {
     player.takeSent(source, width, height, id, moment);
@@ -135,6 +165,7 @@ function note({ frame, pose, guide, isAnnotated }, isSame) {
   }
   const detail = { id: frame?.id ?? null, pose, isAnnotated, takenMs: frame?.takenMs ?? null, drawnMs: nowMs };
   document.dispatchEvent(new CustomEvent("arview:drawn", { detail }));
+  tell("drawn", detail);
 }
 
 // --- status and figures ------------------------------------------------------------------------------
@@ -146,62 +177,58 @@ function refreshState(shown = player?.shown) {
   specimens.show(isLive ? shown?.pose ?? player.answer : null);
   if (player?.isFrozen) {
     const ago = Math.round((Date.now() - player.frozenAt) / 1000);
-    return bar.show("frozen", `picture taken ${ago < 2 ? "just now" : `${ago} s ago`}; press Resume to continue`);
+    return bar.show("frozen", ago < 2 ? t("frozen.now") : t("frozen.ago", { seconds: ago }));
   }
   if (phase.name !== "connected") return bar.show(phase.name, retryText(phase));
   if (part?.source === "phone" && trouble) return bar.show("trouble", trouble);
   if (!player.isAnswered(nowMs)) {
-    const words = status?.feed?.text || (camera.isOn || part?.source !== "phone" ? "for a response of the station" : "for the camera");
+    const words = status?.feed?.text || t(camera.isOn || part?.source !== "phone" ? "why.station" : "why.camera");
     return bar.show("waiting", words);
   }
   const answer = shown?.pose ?? player.answer;
   if (answer.guide_cam_from_model && !answer.cam_from_model) {
-    return bar.show("align", "align the part with the yellow outline");
+    return bar.show("align", t("why.align"));
   }
   if (specimens.isSeveral && answer.parts.length > 1) return bar.show(...summaryOf(answer.parts, specimens.names));
   bar.show(answer.state, reasonOf(answer));
 }
 
-const retryText = ({ text, inS }) => (inS ? `${text}. Trying again${inS >= 2 ? ` every ${Math.round(inS)} s` : "…"}` : text);
-
 function refresh() {
   if (player) refreshState();
   else bar.show(state.phase.name, retryText(state.phase));
-  const { phase, trouble, part, status } = state;
-  const shown = [...(status?.notices ?? [])];
-  if (status?.feed && ["reconnecting", "frozen"].includes(status.feed.state) && !shown.some((one) => one.code.startsWith("source_"))) {
-    shown.push({ level: "error", text: status.feed.text });
-  }
-  if (part?.inspection?.note) shown.push({ level: "warning", text: part.inspection.note });
-  if (!stage.hasGhost) shown.push({ level: "warning", text: "this browser has no WebGL 2: the station draws the overlay" });
-  notices.show(shown.filter((one) => one.level !== "info"));
-  message.show(blocking(phase, trouble, part));
+  const { status } = state;
+  notices.show(allNotices(state, { hasGhost: stage.hasGhost, fallback: connection.fallback }));
+  message.show(blocking(state, { retry: () => connection.retryNow(), startCamera: () => camera.start(state.part.wanted) }));
   const { recording } = status ?? {};
-  setPressed("record", Boolean(recording?.is_on), recording?.is_on ? "stop" : "record", recording?.is_on ? clock(recording.seconds) : "Record");
+  setPressed("record", Boolean(recording?.is_on), recording?.is_on ? "stop" : "record", recording?.is_on ? clock(recording.seconds) : t("actions.record"));
+  if (recording?.is_on) find("record").setAttribute("aria-label", t("actions.record_stop", { time: clock(recording.seconds) }));
+  else find("record").removeAttribute("aria-label");
   const link = connection.link;
   find("link-state").textContent = link
-    ? [`Connected by ${link.kind === "jpeg" ? "JPEG over HTTP" : "WebRTC"}, ${player.mode === "video" ? "annotated video" : "poses"}`,
-      status?.feed ? `${status.feed.tracked_fps.toFixed(0)} of ${status.feed.received_fps.toFixed(0)} pictures per second tracked` : "",
-      link.rttMs === null ? "" : `network ${link.rttMs.toFixed(0)} ms`].filter(Boolean).join("; ")
-    : "Not connected";
+    ? [t(link.kind === "jpeg" ? "link.by_jpeg" : "link.by_webrtc", { mode: t(`link.mode.${player.mode === "video" ? "video" : "poses"}`) }),
+      status?.feed ? t("link.rates", { tracked: status.feed.tracked_fps.toFixed(0), received: status.feed.received_fps.toFixed(0) }) : "",
+      link.rttMs === null ? "" : t("link.network", { ms: link.rttMs.toFixed(0) })].filter(Boolean).join("; ")
+    : t("link.none");
 }
 
-/** The message about what has to be resolved before the page can show anything, or null. */
-function blocking(phase, trouble, part) {
-  if (phase.name === "busy") {
-    return { sign: "busy", title: "Busy", text: `${phase.text}. This page continues as soon as there is room.`, button: "Try now", onPress: () => connection.retryNow() };
-  }
-  if (phase.name === "denied") {
-    return { sign: "offline", title: "This link is no longer valid", text: `${phase.text}.`, button: "Try again", onPress: () => location.reload() };
-  }
-  if (phase.name === "retrying") {
-    return { sign: "offline", title: "Connection lost, retrying", text: `${phase.text}.`, button: "Try now", onPress: () => connection.retryNow() };
-  }
-  if (phase.name === "loading" && phase.text) return { sign: "busy", title: "Loading", text: phase.text, button: "" };
-  if (part?.source === "phone" && trouble) {
-    return { sign: "camera", title: "No camera", text: trouble, button: "Try again", onPress: () => camera.start(part.wanted) };
-  }
-  return null;
+/** For how long nothing has come from the server, s; null while it responds. */
+function staleFor(nowMs) {
+  const { heardMs, phase } = state, silentMs = nowMs - heardMs;
+  return heardMs !== null && (phase.name !== "connected" || silentMs > SILENT_MS) ? silentMs / 1000 : null;
+}
+
+/** Show on the button of the parts how many failed, or are undecided. */
+function showBadge(components) {
+  const button = find("open-parts");
+  button.querySelector(".badge")?.remove();
+  button.removeAttribute("aria-label");
+  const bad = tally(components).find((one) => one.classList.contains("fail") || one.classList.contains("undecided"));
+  if (!bad) return;
+  const badge = document.createElement("span");
+  badge.className = `badge ${bad.classList[1]}`;
+  badge.append(icon(bad.classList[1]), bad.textContent.split(" ")[0]);
+  button.append(badge);
+  button.setAttribute("aria-label", t("actions.badge", { count: bad.textContent }));
 }
 
 setInterval(() => {
@@ -213,7 +240,9 @@ setInterval(() => {
     quality: pose?.isPosed ? Math.min(...pose.parts.filter((one) => one.cam_from_model).map((one) => one.quality)) : pose?.quality ?? null,
     latencyMs: sorted.length ? sorted[sorted.length >> 1] : null,
     ageMs: drawn.frame ? nowMs - drawn.takenMs : null,
+    staleS: staleFor(nowMs),
   });
+  parts.setStale(staleFor(nowMs));
   requestDraw(); // removes the overlay when no poses arrive
   refresh();
 }, FIGURES_EVERY_MS);
@@ -224,6 +253,7 @@ function isolate(name, part = 0) {
   Object.assign(style, { only: name, only_part: name ? part : 0 });
   parts.show(name, part);
   changeStyle();
+  tell("isolate", { name, part });
 }
 
 let styleTimer = 0;
@@ -249,21 +279,35 @@ function setPressed(id, isPressed, sign, text) {
   }
 }
 
-const clock = (seconds) => `${Math.floor(seconds / 60)}:${String(Math.floor(seconds % 60)).padStart(2, "0")}`;
+let sentScreen = "", screenTimer = 0;
+
+/** Tell the server how large its annotated video is shown, so that it draws labels that can be read there. */
+function tellScreen() {
+  clearTimeout(screenTimer);
+  screenTimer = setTimeout(() => {
+    const { size } = stage, { link } = connection;
+    if (!link || !size || player?.mode !== "video") return;
+    const density = Math.min(devicePixelRatio || 1, MAX_DENSITY), step = (px) => SCREEN_STEP_PX * Math.max(1, Math.round((px * density) / SCREEN_STEP_PX));
+    const screen = { width: step(size.width), height: step(size.height), density }, key = JSON.stringify(screen);
+    if (key === sentScreen) return;
+    sentScreen = key;
+    connection.ask({ screen });
+  }, STYLE_DELAY_MS);
+}
 
 function freeze() {
   if (!player?.shown?.frame) return;
   player.isFrozen = !player.isFrozen;
   player.frozenAt = Date.now() - (performance.now() - player.shown.frame.takenMs);
   document.body.classList.toggle("is-frozen", player.isFrozen);
-  setPressed("freeze", player.isFrozen, player.isFrozen ? "play" : "pause", player.isFrozen ? "Resume" : "Freeze");
+  setPressed("freeze", player.isFrozen, player.isFrozen ? "play" : "pause", t(player.isFrozen ? "actions.resume" : "actions.freeze"));
   connection.ask({ hold: player.isFrozen ? player.shown.frame.id : null });
   requestDraw();
 }
 
 async function snapshot() {
   const { link } = connection, frame = player?.shown?.frame;
-  if (!link || !frame) return toast.show("There is no picture yet");
+  if (!link || !frame) return toast.show(t("snapshot.none"));
   try {
     clearTimeout(styleTimer);
     await connection.ask({ hold: frame.id, style });
@@ -271,10 +315,13 @@ async function snapshot() {
     if (!answer.ok) throw new Error((await answer.json()).message);
     const moment = new Date().toISOString().slice(0, 19).replaceAll(":", "");
     const file = [titleOf(partsOf(state.part)).replaceAll(", ", "_").replaceAll(" ", "_"), moment].filter(Boolean).join("_").replace(/[^\w.-]+/g, "-");
-    save(await answer.blob(), `${file}.png`);
-    toast.show("Snapshot saved, with its measurements inside");
+    const blob = await answer.blob();
+    save(blob, `${file}.png`);
+    await keepSnapshot(`${file}.png`, blob);
+    if (sheet.open === "files") files.refresh();
+    toast.show(t("snapshot.saved"));
   } catch (error) {
-    toast.show(`No snapshot: ${error.message}`);
+    toast.show(t("snapshot.failed", { reason: error.message }));
   } finally {
     if (!player.isFrozen) connection.ask({ hold: null });
   }
@@ -285,33 +332,16 @@ function titleOf(all) {
   return all.map(({ part, inspection, name }) => [name || part.name, inspection?.serial || part.serial].filter(Boolean).join(" ")).join(", ");
 }
 
-function save(blob, name) {
-  const link = document.createElement("a");
-  link.href = URL.createObjectURL(blob);
-  link.download = name;
-  link.click();
-  setTimeout(() => URL.revokeObjectURL(link.href), 60_000);
-}
-
 async function record() {
   const isOn = state.status?.recording.is_on;
   if (!isOn) state.isRecording = true;
   const refusal = await connection.ask({ record: !isOn });
-  if (refusal) toast.show(`No recording: ${refusal}`);
+  if (refusal) toast.show(t("record.failed", { reason: refusal }));
 }
 
 function offerRecording(number) {
-  toast.show("Recording finished", { href: `/api/recordings/${number}`, text: "Save it", download: "" });
-}
-
-/** Open a section of the side sheet, or close it. */
-function openSide(section) {
-  const body = document.body, isOpen = body.dataset.side === section;
-  body.dataset.side = isOpen || !section ? "" : section;
-  find("open-parts").setAttribute("aria-expanded", String(body.dataset.side === "parts"));
-  find("open-view").setAttribute("aria-expanded", String(body.dataset.side === "view"));
-  if (body.dataset.side) find("close-side").focus({ preventScroll: true });
-  stage.measure();
+  toast.show(t("record.finished"), { href: `/api/recordings/${number}`, text: t("record.save"), download: "" });
+  if (sheet.open === "files") files.refresh();
 }
 
 function toggle(key) {
@@ -328,19 +358,19 @@ find("opacity").addEventListener("input", (event) => {
   changeStyle();
 });
 find("search-again").addEventListener("click", async () => {
-  toast.show((await connection.ask({ reset: true })) || "Searching for the part again");
+  toast.show((await connection.ask({ reset: true })) || t("view.searching"));
 });
 /** The user says that a part in view is the one to which its labels belong. */
-async function confirmPart(part, name = "this part") {
+async function confirmPart(part, name = t("confirm.this_part")) {
   if (!specimens.waiting.includes(part)) return;
-  toast.show((await connection.ask({ confirm: specimens.isSeveral ? part : true })) || `Confirmed: the labels belong to ${name}`);
+  toast.show((await connection.ask({ confirm: specimens.isSeveral ? part : true })) || t("confirm.done", { name }));
 }
 
 /** Confirm the part that waits for it; of several, the user has to choose. */
 function confirmWaiting() {
   const { waiting, names } = specimens;
   if (waiting.length === 1) confirmPart(waiting[0], specimens.isSeveral ? names[waiting[0]] : undefined);
-  else if (waiting.length > 1) toast.show(`Which one? Press ${waiting.map((id) => `${id + 1} for ${names[id]}`).join(", ")}`);
+  else if (waiting.length > 1) toast.show(t("confirm.which", { choices: waiting.map((id) => t("confirm.choice", { key: id + 1, name: names[id] })).join(", ") }));
 }
 
 find("transports").addEventListener("change", (event) => {
@@ -350,31 +380,39 @@ find("transports").addEventListener("change", (event) => {
 find("freeze").addEventListener("click", freeze);
 find("snapshot").addEventListener("click", snapshot);
 find("record").addEventListener("click", record);
-find("open-parts").addEventListener("click", () => openSide("parts"));
-find("open-view").addEventListener("click", () => openSide("view"));
-find("close-side").addEventListener("click", () => openSide(""));
+connectLook(() => stage.measure());
+connectKeys({
+  c: confirmWaiting, s: snapshot, r: record, g: () => toggle("ghost"), e: () => toggle("edges"), l: () => toggle("labels"),
+  Escape: () => (document.body.dataset.side ? sheet.show("") : isolate(null)),
+  ArrowRight: () => parts.step(1), ArrowLeft: () => parts.step(-1),
+  "+": () => zoom.step(1), "=": () => zoom.step(1), "-": () => zoom.step(-1), 0: () => zoom.reset(),
+  " ": freeze,
+}, () => Object.fromEntries((specimens.isSeveral ? specimens.waiting : []).map((id) => [id + 1, () => confirmPart(id, specimens.names[id])])), stage.viewport, () => stage.moved());
 
-document.addEventListener("keydown", (event) => {
-  if (event.ctrlKey || event.metaKey || event.altKey) return;
-  const isTyping = ["INPUT", "SELECT"].includes(event.target.tagName), isButton = event.target.tagName === "BUTTON";
-  const keys = {
-    c: confirmWaiting, s: snapshot, r: record, g: () => toggle("ghost"), e: () => toggle("edges"), l: () => toggle("labels"),
-    Escape: () => (document.body.dataset.side ? openSide("") : isolate(null)),
-    ArrowRight: () => parts.step(1), ArrowLeft: () => parts.step(-1),
-    " ": freeze,
-  };
-  for (const id of specimens.waiting) if (specimens.isSeveral) keys[id + 1] = () => confirmPart(id, specimens.names[id]);
-  const act = keys[event.key.length === 1 ? event.key.toLowerCase() : event.key];
-  if (!act || (isTyping && event.key !== "Escape") || (isButton && event.key === " ") || event.repeat) return;
-  event.preventDefault();
-  act();
-});
+/** What job/ may use of the page. */
+const host = {
+  state, style, stage, camera, connection, toast, message, isolate, share,
+  get player() { return player; },
+  /** Call a function after each "part", "pose", "status", "drawn", "phase" or "isolate". */
+  on(name, act) { listeners.set(name, [...(listeners.get(name) ?? []), act]); },
+  openSide: (section) => sheet.show(section),
+  /** Ask for the serial number of a part; null when the user cancels. */
+  askSerial: (part = 0, more = {}) => askSerial({
+    frame: () => player?.shown?.frame?.canvas ?? null, seen: () => player?.answer?.parts[part]?.serial ?? "",
+    suggestion: state.part ? partsOf(state.part)[part]?.part?.serial : "", ...more,
+  }),
+};
+// job: mounted here
+void host;
 
 // --- start and end ------------------------------------------------------------------------------
 
-new ResizeObserver(() => {
-  document.documentElement.style.setProperty("--bar", `${find("bar").offsetHeight}px`);
-}).observe(find("bar"));
+const measure = new ResizeObserver(() => {
+  const { style: root } = document.documentElement, top = (id) => find(id).getBoundingClientRect().top || innerHeight;
+  root.setProperty("--bar", `${find("bar").offsetHeight}px`);
+  root.setProperty("--below", `${innerHeight - Math.min(top("actions"), top("card"))}px`);
+});
+for (const id of ["bar", "actions", "card"]) measure.observe(find(id));
 
 let wakeLock = null;
 

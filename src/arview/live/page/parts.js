@@ -2,19 +2,19 @@
 
 import { icon, make } from "./icons.js";
 import { exact, rounded } from "./rounding.js";
+import { spanText } from "./status.js";
+import { t } from "./texts/texts.js";
 
 const ORDER = ["fail", "undecided", "not_measured", "measured", "pass"];
-const VERDICT_TEXTS = { fail: "FAIL", undecided: "UNDECIDED", measured: "MEASURED", not_measured: "NOT MEASURED", pass: "PASS" };
-
 const COMPLETENESS = { COMPLETE: "pass", INCOMPLETE: "fail", "NOT YET CHECKED": "undecided" };
 
 /** An age as text, such as "3 h ago", in the largest unit of which there are at least two. */
 export function ageText(seconds) {
-  if (seconds < -60) return "in the future";
-  for (const [unit, length] of [["d", 86400], ["h", 3600]]) {
-    if (seconds >= 2 * length) return `${Math.round(seconds / length)} ${unit} ago`;
+  if (seconds < -60) return t("age.future");
+  for (const [unit, length] of [["days", 86400], ["hours", 3600]]) {
+    if (seconds >= 2 * length) return t(`age.${unit}`, { count: Math.round(seconds / length) });
   }
-  return seconds >= 60 ? `${Math.round(seconds / 60)} min ago` : "just now";
+  return seconds >= 60 ? t("age.minutes", { count: Math.round(seconds / 60) }) : t("age.now");
 }
 
 /** The lists of all parts, and one card. */
@@ -40,6 +40,15 @@ export class PartLists {
     }
     parts.forEach((part, id) => this.#lists[id].setPart(part));
     this.show(this.only.name, this.only.part);
+  }
+
+  /** Say that the verdicts are as old as this, s, because the server is gone; null while it is not. */
+  setStale(seconds) {
+    const text = seconds === null ? "" : t("parts.stale", { age: spanText(seconds) });
+    for (const list of this.#lists) {
+      list.stale.hidden = seconds === null;
+      if (list.stale.textContent !== text) list.stale.textContent = text;
+    }
   }
 
   /** Take over what a pose says of the components of all parts. */
@@ -76,10 +85,12 @@ class PartList {
   constructor(onPick, onStep) {
     Object.assign(this, { onPick, onStep });
     this.name = make("p", "part-name");
+    this.stale = make("p", "stale-note");
+    this.stale.hidden = true;
     this.tally = make("div", "tally");
     this.list = make("ul", "components");
     this.provenance = make("p", "provenance");
-    this.section = make("div", "panel", [this.name, this.tally, this.list, this.provenance]);
+    this.section = make("div", "panel", [this.name, this.stale, this.tally, this.list, this.provenance]);
     this.only = null;
     this.components = [];
     this.seen = new Map();
@@ -108,7 +119,9 @@ class PartList {
     const sign = mark ? [make("span", "mark", [mark])] : [];
     for (const one of sign) one.style.color = tag_color;
     this.name.replaceChildren(...sign, make("b", "", [name || part.name]), serial ? ` ${serial}` : "");
-    const provenance = inspection ? `Inspected ${ageText(inspection.age_s)}${inspection.method ? `, ${inspection.method}` : ""}` : "Not inspected yet";
+    const provenance = inspection
+      ? t(inspection.method ? "parts.inspected_by" : "parts.inspected", { age: ageText(inspection.age_s), method: inspection.method })
+      : t("parts.not_inspected");
     this.provenance.replaceChildren(provenance);
     this.names = components.map((one) => one.name);
     this.seen = new Map();
@@ -125,9 +138,9 @@ class PartList {
 
   /** Classes, value, U, word and notes of a component, by what was measured and what is seen. */
   #state(one) {
-    if (this.withheld) return { kind: "none", value: "", u: null, word: "withheld", notes: [] };
+    if (this.withheld) return { kind: "none", value: "", u: null, word: t("parts.withheld"), notes: [] };
     const seen = this.seen.get(one.name);
-    const plain = { kind: one.verdict ?? "none", value: one.value_text || (one.missing ? "missing" : "–"), u: one.uncertainty_mm, word: one.verdict_text ?? "not inspected", notes: [] };
+    const plain = { kind: one.verdict ?? "none", value: one.value_text || (one.missing ? t("parts.missing") : "–"), u: one.uncertainty_mm, word: one.verdict ? t(`verdict.${one.verdict}`) : one.verdict_text ?? t("parts.no_verdict"), notes: [] };
     if (!seen || (one.verdict === null && seen.is_dimmed)) return plain;
     if (!["missing", "displaced"].includes(seen.evidence)) return { ...plain, kind: `${plain.kind}${seen.is_dimmed ? " dimmed" : ""}`, notes: seen.notes };
     return { kind: seen.evidence, value: seen.value, u: null, word: seen.word, notes: seen.notes };
@@ -173,24 +186,24 @@ class PartList {
       made.addEventListener("click", onClick);
       return made;
     };
-    const forward = button("back", "Next component", () => this.onStep(1));
+    const forward = button("back", t("card.next"), () => this.onStep(1));
     forward.classList.add("forward");
     const { kind, word, value, notes } = this.#state(one);
     const remark = notes.length ? [make("p", "axes", [make("span", "", [notes.join(", ")])])] : [];
     const head = make("div", "head", [
-      button("back", "Previous component", () => this.onStep(-1)),
+      button("back", t("card.previous"), () => this.onStep(-1)),
       make("span", "title", [make("b", "", [one.name]), make("span", "verdict", [icon(kind.split(" ")[0]), word])]),
-      forward, button("close", "Show all components", () => this.onPick(null)),
+      forward, button("close", t("card.all"), () => this.onPick(null)),
     ]);
     if (this.withheld) return [head, make("p", "rest", [this.withheld.text])];
-    if (["missing", "displaced"].includes(kind)) return [head, make("p", "big", [value || "missing"]), ...remark];
+    if (["missing", "displaced"].includes(kind)) return [head, make("p", "big", [value || t("parts.missing")]), ...remark];
     if (one.distance_mm === null) {
-      return [head, make("p", "big", [one.value_text || (one.verdict ? "not measured" : "not part of the inspection")])];
+      return [head, make("p", "big", [one.value_text || t(one.verdict ? "card.not_measured" : "card.not_inspected")])];
     }
     const u = one.uncertainty_mm ?? 0;
     const numbers = make("p", "numbers", [
       make("span", "big", [one.value_text]),
-      make("span", "rest", [`U ${rounded(u, u)} mm (k = 2)`, ...(one.tolerance_mm === null ? [] : [make("br"), `tolerance ${exact(one.tolerance_mm)} mm`])]),
+      make("span", "rest", [t("card.u", { u: rounded(u, u) }), ...(one.tolerance_mm === null ? [] : [make("br"), t("card.tolerance", { tolerance: exact(one.tolerance_mm) })])]),
     ]);
     const axes = one.displacement_mm.map((value, k) => {
       const text = value === null ? "?" : `${value < 0 ? "−" : "+"}${rounded(Math.abs(value), u)}`;
@@ -212,7 +225,7 @@ function gauge({ distance_mm: d, uncertainty_mm: u, tolerance_mm: tolerance }) {
     return made;
   };
   const bar = make("div", "gauge", [part("allowed", 0, tolerance), part("band", d - (u ?? 0), d + (u ?? 0)), part("limit", tolerance), part("mark", d)], {
-    role: "img", "aria-label": `${rounded(d, u)} mm with U ${rounded(u ?? 0, u)} against a tolerance of ${exact(tolerance)} mm`,
+    role: "img", "aria-label": t("card.gauge", { value: rounded(d, u), u: rounded(u ?? 0, u), tolerance: exact(tolerance) }),
   });
   return [bar];
 }
@@ -221,6 +234,6 @@ function gauge({ distance_mm: d, uncertainty_mm: u, tolerance_mm: tolerance }) {
 export function tally(components) {
   return ORDER.flatMap((verdict) => {
     const count = components.filter((one) => one.verdict === verdict).length;
-    return count ? [make("span", `count ${verdict}`, [icon(verdict), `${count} ${VERDICT_TEXTS[verdict]}`])] : [];
+    return count ? [make("span", `count ${verdict}`, [icon(verdict), t("parts.count", { count, verdict: t(`verdict.${verdict}`) })])] : [];
   });
 }

@@ -2,18 +2,14 @@
 
 import { icon, make } from "./icons.js";
 import { STATES } from "./status.js";
+import { hasText, t } from "./texts/texts.js";
 
 const SEVERITY = ["tracked", "critical", "searching", "lost"];
-const DEFAULTS = {
-  critical: "the pose is uncertain",
-  searching: "for the part in the picture",
-  lost: "the part is no longer found",
-};
 
 /** What a pose says of a part in one line: incomplete, withheld, the reason of its state, mismatches. */
 export function reasonOf({ state, remark, completeness, withheld, mismatches }) {
-  const reason = remark || DEFAULTS[state];
-  const found = completeness.startsWith("INCOMPLETE") ? ["INCOMPLETE"] : [];
+  const reason = remark || (hasText(`why.${state}`) ? t(`why.${state}`) : "");
+  const found = completeness.startsWith("INCOMPLETE") ? [t("why.incomplete")] : [];
   return [...found, ...(withheld ? [`${withheld.title}: ${withheld.text}`] : []), ...(reason ? [reason] : []), ...mismatches].join("; ");
 }
 
@@ -22,8 +18,8 @@ export function summaryOf(parts, names) {
   const tracked = parts.filter((one) => one.state === "tracked").length;
   const isWaiting = parts.filter((one) => one.withheld);
   const worst = parts.reduce((a, b) => (SEVERITY.indexOf(b.state) > SEVERITY.indexOf(a.state) ? b : a));
-  const words = tracked === parts.length ? [`all ${parts.length} parts`] : [`${tracked} of ${parts.length} parts tracked`];
-  if (isWaiting.length) words.push(`to be confirmed: ${isWaiting.map(({ id }) => names[id]).join(", ")}`);
+  const words = [t(tracked === parts.length ? "why.all_parts" : "why.some_parts", { tracked, count: parts.length })];
+  if (isWaiting.length) words.push(t("why.to_confirm", { names: isWaiting.map(({ id }) => names[id]).join(", ") }));
   const isPartly = worst.state === "searching" && tracked > 0;
   return [isPartly ? "critical" : worst.state, words.join("; ")];
 }
@@ -79,7 +75,7 @@ export class Specimens {
     for (const [id, button] of this.buttons.entries()) button.hidden = !this.#waiting.includes(id);
     if (this.isSeveral) this.confirm.hidden = true;
     for (const [id, { sign, word, quality, why, element }] of this.rows.entries()) {
-      const one = states[id], state = one?.state ?? "waiting", [name, text] = STATES[state];
+      const one = states[id], state = one?.state ?? "waiting", name = STATES[state], text = t(`state.${state}`);
       element.className = one?.completeness.startsWith("INCOMPLETE") ? "fail" : state;
       sign.replaceChildren(icon(name));
       word.textContent = text;
@@ -91,7 +87,7 @@ export class Specimens {
   #button({ id, mark, name, tag_color }) {
     const sign = make("span", "mark", [mark]);
     sign.style.color = tag_color;
-    const button = make("button", "wide", [sign, `This is ${name}`, make("kbd", "", [String(id + 1)])], { "aria-keyshortcuts": String(id + 1) });
+    const button = make("button", "wide", [sign, t("confirm.named", { name }), make("kbd", "", [String(id + 1)])], { "aria-keyshortcuts": String(id + 1) });
     button.hidden = true;
     button.addEventListener("click", () => this.onConfirm(id, name));
     this.confirms.append(button);

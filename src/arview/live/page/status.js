@@ -1,30 +1,32 @@
 // The status display: state and reason, figures, notices, messages that block the page, toasts.
 
 import { icon, make } from "./icons.js";
+import { t } from "./texts/texts.js";
 
+/** The icon of each state; its word is the text state.NAME. */
 export const STATES = {
-  tracked: ["tracked", "Tracked"],
-  critical: ["critical", "Critical"],
-  searching: ["searching", "Searching"],
-  lost: ["lost", "Lost"],
-  align: ["align", "Align"],
-  loading: ["busy", "Loading"],
-  connecting: ["busy", "Connecting"],
-  retrying: ["offline", "Connection lost"],
-  busy: ["busy", "Busy"],
-  denied: ["offline", "Access denied"],
-  trouble: ["camera", "No camera"],
-  waiting: ["busy", "Waiting"],
-  frozen: ["pause", "Frozen"],
+  tracked: "tracked", critical: "critical", searching: "searching", lost: "lost", align: "align", loading: "busy",
+  connecting: "busy", retrying: "offline", busy: "busy", denied: "offline", trouble: "camera", waiting: "busy", frozen: "pause",
 };
-/** Notices that the inspector must not miss, with a prefix for their text. */
-const STRONG = { inspection_old: "Stale inspection: ", inspection_serial: "", inspection_model: "", inspection_unreadable: "" };
+/** Notices that the inspector must not miss, some with a text around that of the server. */
+const STRONG = {
+  inspection_old: "notice.inspection_old", inspection_serial: "", inspection_model: "", inspection_unreadable: "",
+  inspection_future: "", disk_low: "notice.disk",
+};
 const RANKS = { error: 0, warning: 1, info: 2 };
 
 const capitalized = (text) => text.charAt(0).toUpperCase() + text.slice(1);
 
+/** A duration as text, such as "12 s", in the largest unit of which there are at least two. */
+export function spanText(seconds) {
+  for (const [unit, length] of [["days", 86400], ["hours", 3600], ["minutes", 60]]) {
+    if (seconds >= 2 * length) return t(`span.${unit}`, { count: Math.round(seconds / length) });
+  }
+  return t("span.seconds", { count: Math.max(0, Math.round(seconds)) });
+}
+
 export class StatusBar {
-  /** @param elements {icon, word, why, quality, meter, latency, age, body} */
+  /** @param elements {icon, word, why, quality, meter, latency, age, stale, body} */
   constructor(elements) {
     Object.assign(this, elements);
     this.#shown = "";
@@ -37,15 +39,22 @@ export class StatusBar {
     const text = `${state} ${reason}`;
     if (text === this.#shown) return;
     this.#shown = text;
-    const [sign, word] = STATES[state];
+    const sign = STATES[state], word = t(`state.${state}`);
     this.body.dataset.state = state;
     this.icon.replaceChildren(icon(sign));
     if (this.word.textContent !== word) this.word.textContent = word;
     this.why.textContent = capitalized(reason);
   }
 
-  /** Show the figures; null is shown as a dash. */
-  figures({ quality, latencyMs, ageMs }) {
+  /** Show the figures; null is shown as a dash. Of a server that is gone they stay, dimmed, with their age. */
+  figures({ quality, latencyMs, ageMs, staleS = null }) {
+    this.body.classList.toggle("is-stale", staleS !== null);
+    this.stale.hidden = staleS === null;
+    if (staleS !== null) {
+      const text = t("figures.stale", { age: spanText(staleS) });
+      if (this.stale.textContent !== text) this.stale.textContent = text;
+      return;
+    }
     const text = (value, unit, digits = 0) => (value === null ? "–" : `${value.toFixed(digits)} ${unit}`);
     this.quality.textContent = quality === null ? "–" : `${Math.round(100 * quality)} %`;
     this.meter.value = quality ?? 0;
@@ -76,10 +85,11 @@ export class Notices {
     const shown = this.#isOpen ? this.notices : this.notices.slice(0, 1), more = this.notices.length - 1;
     this.box.replaceChildren(
       ...shown.map(({ code, level, text }, i) => {
-        const inside = [icon(level), make("span", "text", [capitalized((STRONG[code] ?? "") + text)])];
-        if (i === 0 && more > 0) inside.push(make("span", "more", [this.#isOpen ? "less" : `+${more}`]));
+        const inside = [icon(level), make("span", "text", [capitalized(STRONG[code] ? t(STRONG[code], { text }) : text)])];
+        if (i === 0 && more > 0) inside.push(make("span", "more", [this.#isOpen ? t("notices.less") : `+${more}`]));
         const classes = `notice ${level} ${code in STRONG ? "strong" : ""} ${this.#isOpen ? "open" : ""}`;
         const line = make("button", classes, inside, { "aria-expanded": String(this.#isOpen) });
+        if (i === 0 && more > 0) inside.at(-1).setAttribute("aria-label", this.#isOpen ? t("notices.fewer") : t("notices.more", { count: more }));
         line.addEventListener("click", () => {
           this.#isOpen = !this.#isOpen;
           this.#draw();

@@ -2,12 +2,14 @@
 
 import { ask, getPart } from "./transport/api.js";
 import { Message, Notices } from "./status.js";
+import { t, translate } from "./texts/texts.js";
 
 const REFRESH_MS = 2000;
 const film = document.getElementById("film");
 const notices = new Notices(document.getElementById("notices")), message = new Message(document.getElementById("message"));
 
 history.replaceState(null, "", location.pathname);
+translate();
 
 let isOn = false;
 
@@ -23,7 +25,7 @@ async function refresh() {
   try {
     const part = await getPart();
     if (part.state !== "ready") {
-      message.show({ sign: "busy", title: part.state === "failed" ? "The part cannot be shown" : "Loading", text: part.text });
+      message.show({ sign: "busy", title: t(part.state === "failed" ? "message.failed" : "message.loading"), text: part.text });
       return;
     }
     document.title = `${part.part.name} ${part.part.serial} · arview`;
@@ -32,15 +34,15 @@ async function refresh() {
     if (!isOn) begin();
     const { feed } = status;
     if (!feed && part.source === "phone" && status.clients === 0) {
-      message.show({ sign: "camera", title: "No phone yet", text: "The picture of the phone that joins next is shown here." });
+      message.show({ sign: "camera", title: t("message.no_phone"), text: t("message.no_phone.text") });
     } else if (feed && feed.state !== "live") {
-      message.show({ sign: "offline", title: "No picture", text: feed.text });
+      message.show({ sign: "offline", title: t("message.no_picture"), text: feed.text });
     } else {
       message.show(null);
     }
   } catch (error) {
     isOn = false;
-    const title = error.code === "no_token" ? "This link is no longer valid" : "Connection lost, retrying";
+    const title = t(error.code === "no_token" ? "message.denied" : "message.lost");
     message.show({ sign: "offline", title, text: error.message });
   }
 }

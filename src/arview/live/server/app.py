@@ -240,7 +240,9 @@ class Handlers:
         """The response to a page without WebRTC for a tracked frame."""
         if client.mode == "poses":
             return _json_response(pose_document(tracked, time.monotonic()))
-        return _jpeg_response(await asyncio.to_thread(lambda: client.annotator.draw(tracked).jpeg), tracked)
+        return _jpeg_response(
+            await asyncio.to_thread(lambda: client.annotator.draw(tracked, screen=client.screen).jpeg), tracked
+        )
 
 
 def refusal_handlers() -> dict[type[Exception], ErrorHandler]:

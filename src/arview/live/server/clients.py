@@ -12,7 +12,7 @@ from typing import Any, get_args
 from arview.errors import InputError
 from arview.live.protocol import FRAME_IDS, Transport, ViewMode
 from arview.live.security.refusals import Refusal
-from arview.live.stream.annotator import FrameAnnotator
+from arview.live.stream.annotator import FrameAnnotator, Screen
 from arview.live.stream.feed import Feed, TrackedFrame
 from arview.live.stream.newest import AsyncNewestSlot
 from arview.live.stream.subject import OverlayStyle
@@ -38,6 +38,7 @@ class Client:
         feed, annotator: those of the phone, or those that all pages of a station camera share.
         transport: how frames and poses are transmitted.
         mode: what the page wants to receive.
+        screen: where the page shows annotated video; None: it is not told.
         connection: the WebRTC connection, if that is the transport.
         inbox: newest frame of the feed, for the transport without WebRTC.
         held: frame that is kept for a snapshot.
@@ -56,6 +57,7 @@ class Client:
     ) -> None:
         self.name, self.device = secrets.token_urlsafe(12), device
         self.feed, self.annotator, self.transport, self.mode = feed, annotator, transport, mode
+        self.screen: Screen | None = None
         self.connection: Connection | None = None
         self.inbox: AsyncNewestSlot[TrackedFrame] = AsyncNewestSlot(asyncio.get_running_loop())
         self.held: TrackedFrame | None = None
@@ -94,6 +96,19 @@ def choice_of(value: Any, kind: Any, name: str) -> Any:
     return value
 
 
+def screen_of(value: Any) -> Screen | None:
+    """The ``screen`` of a *Control* request; None when it is none."""
+    if not isinstance(value, dict) or value.keys() != {"width", "height", "density"}:
+        return None
+    numbers = [value[key] for key in ("width", "height", "density")]
+    if any(isinstance(one, bool) or not isinstance(one, int | float) for one in numbers):
+        return None
+    width, height, density = numbers
+    if not all(float(side).is_integer() and 64 <= side <= 8192 for side in (width, height)):
+        return None
+    return Screen(int(width), int(height), float(density)) if 0.5 <= density <= 8.0 else None
+
+
 def check_control(control: dict[str, Any], style: OverlayStyle, components: Sequence[Sequence[str]]) -> OverlayStyle:
     """The overlay style after a *Control* request, all of which is checked.
 
@@ -116,6 +131,7 @@ def check_control(control: dict[str, Any], style: OverlayStyle, components: Sequ
             "reset": isinstance(value, bool) or is_part(value),
             "confirm": (isinstance(value, bool) and (len(components) == 1 or not value)) or is_part(value),
             "record": isinstance(value, bool),
+            "screen": value is None or screen_of(value) is not None,
             "hold": value is None or (type(value) is int and 0 <= value < FRAME_IDS),
         }.get(key, False)
         if not is_good:

@@ -16,7 +16,7 @@ from arview.live.options import LiveOptions
 from arview.live.protocol import Transport, ViewMode
 from arview.live.security.devices import Devices
 from arview.live.security.refusals import Refusal
-from arview.live.server.clients import Client, check_control, choice_of
+from arview.live.server.clients import Client, check_control, choice_of, screen_of
 from arview.live.server.glb import model_glb
 from arview.live.server.workers import in_daemon_thread
 from arview.live.stream.annotator import FrameAnnotator
@@ -199,6 +199,7 @@ class Hub:
                 raise Refusal(404, "no_such_frame", "that frame is no longer kept")
         client.annotator.style = style
         client.mode = request.get("mode", client.mode)
+        client.screen = screen_of(request["screen"]) if "screen" in request else client.screen
         for what, act in (("reset", client.feed.reset), ("confirm", client.feed.confirm)):
             if (wanted := request.get(what, False)) is not False:
                 act(None if wanted is True else wanted)
@@ -277,8 +278,9 @@ class Hub:
             leaving.add_done_callback(self._leaving.discard)
 
         connection = Connection(
-            client.feed, client.annotator, lambda: client.mode, self._addresses, ended, self.options.webrtc
-        )
+            client.feed, client.annotator, lambda: client.mode, self._addresses, ended, self.options.webrtc,
+            screen=lambda: client.screen,
+        )  # fmt: skip
         client.connection = connection
         try:
             return await asyncio.wait_for(connection.answer(sdp), self.options.webrtc.offer_timeout_s)

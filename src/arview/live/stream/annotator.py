@@ -7,12 +7,41 @@ from collections import OrderedDict
 from dataclasses import dataclass, replace
 from functools import cached_property
 
+import cv2
+import numpy as np
+
 from arview.camera import Camera
 from arview.live.stream.feed import TrackedFrame
 from arview.live.stream.frames import to_jpeg
 from arview.live.stream.subject import OverlayStyle
 from arview.live.stream.subjects import FrameOverlay, Subjects
 from arview.video import Image
+
+
+@dataclass(frozen=True)
+class Screen:
+    """The size that a page shows its picture at.
+
+    Attributes:
+        width, height: px of the screen.
+        density: px of the screen for each CSS px.
+        text_css_px: size of the text on labels, CSS px.
+    """
+
+    width: int
+    height: int
+    density: float
+    text_css_px: float = 13.0
+
+    def fitted(self, camera: Camera) -> Camera:
+        """The camera of the picture that is drawn: with even sides, and no larger than the screen or its own frames."""
+        share = min(1.0, self.width / camera.width, self.height / camera.height)
+        width, height = (max(64, 2 * round(share * side / 2)) for side in (camera.width, camera.height))
+        return camera if share == 1.0 else camera.scaled(width, height)
+
+    def text_px(self, camera: Camera) -> int:
+        """Size of the text in a picture of this camera that is shown on the whole width of the screen."""
+        return max(9, round(self.text_css_px * self.density * camera.width / self.width))
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,10 +63,11 @@ class AnnotatedFrame:
 
 
 class _StyleRenderer:
-    """Draws in one style and keeps the last annotated frame."""
+    """Draws in one style, for one screen, and keeps the last annotated frame."""
 
-    def __init__(self, subjects: Subjects, style: OverlayStyle) -> None:
-        self._subjects, self._style = subjects, style
+    def __init__(self, subjects: Subjects, style: OverlayStyle, screen: Screen | None) -> None:
+        self._subjects, self._style, self._screen = subjects, style, screen
+        self._camera: Camera | None = None
         self._overlay: FrameOverlay | None = None
         self._made_for: tuple[Camera, int] | None = None
         self._last: AnnotatedFrame | None = None
@@ -48,9 +78,15 @@ class _StyleRenderer:
         revision, camera = self._subjects.revision, tracked.camera
         made_for = self._made_for
         if self._overlay is None or made_for is None or made_for[0] is not camera or made_for[1] != revision:
-            self._overlay = self._subjects.overlay(camera, self._style)
+            self._camera = camera if self._screen is None else self._screen.fitted(camera)
+            text_px = None if self._screen is None else self._screen.text_px(self._camera)
+            self._overlay = self._subjects.overlay(self._camera, replace(self._style, text_px=text_px))
             self._made_for = camera, revision
-        self._last = AnnotatedFrame(tracked, self._overlay.draw(tracked.frame.image, tracked.poses))
+        image = tracked.frame.image
+        if self._camera is not None and self._camera is not camera:
+            size = self._camera.width, self._camera.height
+            image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
+        self._last = AnnotatedFrame(tracked, self._overlay.draw(image, tracked.poses))
         return self._last
 
 
@@ -67,24 +103,28 @@ class FrameAnnotator:
         self.style = OverlayStyle()
         self._subjects = subjects
         self._lock = threading.Lock()
-        self._renderers: OrderedDict[OverlayStyle, _StyleRenderer] = OrderedDict()
+        self._renderers: OrderedDict[tuple[OverlayStyle, Screen | None], _StyleRenderer] = OrderedDict()
 
-    def draw(self, tracked: TrackedFrame, style: OverlayStyle | None = None) -> AnnotatedFrame:
+    def draw(
+        self, tracked: TrackedFrame, style: OverlayStyle | None = None, screen: Screen | None = None
+    ) -> AnnotatedFrame:
         """The annotated frame. Drawing takes some milliseconds, so do not call this in the event loop.
 
         Args:
             tracked: the frame and its pose.
             style: overlay style; default: the one that the pages have chosen.
+            screen: where the picture is shown: it is made no larger, and its labels can be read there; default: the
+                picture has the size of the frame.
         """
-        wanted = style or self.style
+        wanted = style or self.style, screen
         lock, renderers = self._lock, self._renderers
         if not lock.acquire(timeout=self._subjects.options.feed.draw_timeout_s):
             # The thread that draws does not come back: it keeps its renderers, and others get new ones.
             if lock is self._lock:
                 self._lock, self._renderers = threading.Lock(), OrderedDict()
-            return self.draw(tracked, style)
+            return self.draw(tracked, style, screen)
         try:
-            renderer = renderers.pop(wanted, None) or _StyleRenderer(self._subjects, wanted)
+            renderer = renderers.pop(wanted, None) or _StyleRenderer(self._subjects, *wanted)
             renderers[wanted] = renderer
             if len(renderers) > self._subjects.options.feed.kept_styles:
                 renderers.popitem(last=False)

@@ -41,6 +41,7 @@ class OverlayStyle:
     only: str | None = None  # the only component that is drawn and labelled; None: all
     only_part: int = 0  # number of the part to which that component belongs
     status: bool = True  # the status line at the lower edge; the page shows the same as text
+    text_px: int | None = None  # size of the text on labels; None: in proportion to the height of the picture
 
     def __post_init__(self) -> None:
         self.overlay_options()
@@ -53,6 +54,7 @@ class OverlayStyle:
             show_labels=self.labels,
             show_status=self.status,
             opacity=self.opacity,
+            text_px=self.text_px,
         )
 
 

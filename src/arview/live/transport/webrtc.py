@@ -22,7 +22,7 @@ from av.video.frame import VideoFrame
 from arview.errors import InputError
 from arview.live.options import WebrtcOptions
 from arview.live.protocol import CHANNEL, ViewMode
-from arview.live.stream.annotator import FrameAnnotator
+from arview.live.stream.annotator import FrameAnnotator, Screen
 from arview.live.stream.documents import Document, pose_document
 from arview.live.stream.feed import Feed, TrackedFrame
 from arview.live.stream.frames import IncomingFrame, from_stamped
@@ -52,13 +52,20 @@ class OutgoingVideoTrack(MediaStreamTrack):
         annotator: draws the overlay on its frames.
         mode: called for each frame. In mode "video" annotated frames are sent, in mode "poses" the plain frames of a
             station camera; a phone has its own frames.
+        screen: called for each annotated frame; returns where it is shown, if that is known.
     """
 
     kind = "video"
 
-    def __init__(self, feed: Feed, annotator: FrameAnnotator, mode: Callable[[], ViewMode]) -> None:
+    def __init__(
+        self,
+        feed: Feed,
+        annotator: FrameAnnotator,
+        mode: Callable[[], ViewMode],
+        screen: Callable[[], Screen | None] = lambda: None,
+    ) -> None:
         super().__init__()
-        self._feed, self._annotator, self._mode = feed, annotator, mode
+        self._feed, self._annotator, self._mode, self._screen = feed, annotator, mode, screen
         self._inbox: AsyncNewestSlot[TrackedFrame] = AsyncNewestSlot(asyncio.get_running_loop())
         self._began_s = time.monotonic()
         self._ticks = -1
@@ -84,7 +91,9 @@ class OutgoingVideoTrack(MediaStreamTrack):
         super().stop()
 
     def _frame(self, tracked: TrackedFrame, mode: ViewMode) -> VideoFrame:
-        image = self._annotator.draw(tracked).image if mode == "video" else tracked.frame.image
+        image = tracked.frame.image
+        if mode == "video":
+            image = self._annotator.draw(tracked, screen=self._screen()).image
         height, width = image.shape[0] // 2 * 2, image.shape[1] // 2 * 2
         return VideoFrame.from_ndarray(stamped(image[:height, :width], tracked.frame.frame_id), format="rgb24")
 
@@ -99,6 +108,7 @@ class Connection:
         addresses: addresses at which ICE candidates are offered.
         on_end: called once when the connection has failed or the page has closed it.
         options: limits.
+        screen: called for each annotated frame; returns where it is shown, if that is known.
 
     Attributes:
         is_connected: whether the connection is established.
@@ -113,8 +123,9 @@ class Connection:
         addresses: Sequence[str],
         on_end: Callable[[], None],
         options: WebrtcOptions | None = None,
+        screen: Callable[[], Screen | None] = lambda: None,
     ) -> None:
-        self._feed, self._annotator, self._mode = feed, annotator, mode
+        self._feed, self._annotator, self._mode, self._screen = feed, annotator, mode, screen
         self._addresses, self._on_end = addresses, on_end
         self._options = options or WebrtcOptions()
         self._peer = RTCPeerConnection(RTCConfiguration(iceServers=[]))
@@ -142,7 +153,7 @@ class Connection:
             videos = [one for one in self._peer.getTransceivers() if one.kind == "video"]
             if len(videos) != 1 or self._peer.sctp is None:
                 raise InputError("the offer needs one video transceiver and one data channel")
-            self._track = OutgoingVideoTrack(self._feed, self._annotator, self._mode)
+            self._track = OutgoingVideoTrack(self._feed, self._annotator, self._mode, self._screen)
             self._peer.addTrack(self._track)
             restrict_candidates(self._peer, self._addresses)
             await self._peer.setLocalDescription(await self._peer.createAnswer())

@@ -5,6 +5,7 @@ import { icon, make } from "../icons.js";
 import { rounded } from "../rounding.js";
 import { LabelLayout } from "./layout.js";
 import { toCam } from "./projection.js";
+import { t } from "../texts/texts.js";
 
 const MAX_LABELS = 12;
 const NARROW_PX = 560, MAX_NARROW_LABELS = 4; // on a phone in portrait more labels would hide the part
@@ -14,6 +15,7 @@ const CONTEXT_WEIGHT = 0.25; // cost of covering a component that was not inspec
 const REFUTED = ["missing", "displaced"]; // evidence that a component is not at its nominal place
 const TAIL_LETTERS = 6; // end of a name that is never cut
 const EDGE_PX = 22; // distance of the tail of an arrow at the border of the picture
+const OUTSIDE = 1.3; // distance from the middle, relative to the border, of a point that stands for one behind the camera
 const SVG = "http://www.w3.org/2000/svg";
 const STUB_PX = 10, SIGN_PX = 24, ARROW_HEAD_PX = 11;
 
@@ -114,16 +116,14 @@ export class Labels {
    * Place labels and arrows for the poses of a frame.
    * @param place {left, top, scale} position of the picture on the stage: CSS px = left + scale * (u + 0.5).
    * @param area {left, top, width, height} that labels may use, CSS px.
+   * @param seen {left, top, right, bottom}: the piece of the picture that is in view, CSS px.
    */
-  update(pose, place, area, { labels, only, only_part }, glides) {
+  update(pose, place, area, { labels, only, only_part }, glides, seen) {
     const toScreen = (part, point) => {
       const { cam_from_model } = pose.parts[part], pixel = cam_from_model && pose.lens.project(toCam(cam_from_model, point));
       return pixel && [place.left + place.scale * (pixel[0] + 0.5), place.top + place.scale * (pixel[1] + 0.5)];
     };
-    const picture = {
-      left: place.left, top: place.top, right: place.left + place.scale * pose.lens.width,
-      bottom: place.top + place.scale * pose.lens.height,
-    };
+    const picture = seen;
     this.box.classList.remove("empty");
     const wanted = this.inspected.filter(({ name, part }) => !this.withheld[part] && (!only || (name === only && part === only_part)));
     const tags = this.#putTags(toScreen, picture);
@@ -145,7 +145,7 @@ export class Labels {
     const requests = [], signs = new Map();
     for (const label of this.#labels.values()) label.pointer.setAttribute("visibility", "hidden");
     for (const component of labels ? wanted : []) {
-      let anchor = toScreen(component.part, component.anchor_in_model);
+      let anchor = toScreen(component.part, component.anchor_in_model) ?? this.#behind(pose, component, picture);
       const label = this.#labels.get(component.index), outside = anchor && !isInside(anchor, picture) && this.#isUrgent(component);
       if (outside) anchor = this.#pointOut(label, anchor, picture);
       this.#pointHere(label, component, outside, toScreen);
@@ -208,10 +208,10 @@ export class Labels {
     label.key = key;
     label.width = 0;
     const kind = REFUTED.includes(seen?.evidence) ? seen.evidence : component.verdict ?? "none";
-    const value = seen ? seen.value : component.value_text || (component.missing ? "missing" : "");
+    const value = seen ? seen.value : component.value_text || (component.missing ? t("parts.missing") : "");
     const u = kind === component.verdict ? component.uncertainty_mm : null;
     const detail = seen ? seen.notes.join(", ") : component.verdict !== "pass" ? component.detail_text : "";
-    const what = [make("span", "verdict", [seen?.word ?? component.verdict_text ?? ""])];
+    const what = [make("span", "verdict", [seen?.word ?? (component.verdict ? t(`verdict.${component.verdict}`) : component.verdict_text ?? "")])];
     if (u !== null && (seen || !detail)) what.unshift(make("span", "u", [`U ${rounded(u, u)}`]));
     if (value) what.unshift(make("span", "value", [value]));
     const rows = [make("span", "who", [...this.#mark(component.part), icon(kind), middled(component.name)]), make("span", "what", what)];
@@ -229,6 +229,15 @@ export class Labels {
 
   #isUrgent({ index, verdict }) {
     return this.seen.get(index)?.is_urgent ?? (verdict === "fail" || verdict === "undecided");
+  }
+
+  /** A point outside the picture in the direction of an urgent component that the lens does not see, because it is behind it or far aside. */
+  #behind(pose, component, { left, top, right, bottom }) {
+    const { cam_from_model } = pose.parts[component.part];
+    if (!cam_from_model || !this.#isUrgent(component)) return null;
+    const [x, y] = toCam(cam_from_model, component.anchor_in_model), half = [(right - left) / 2, (bottom - top) / 2];
+    const reach = OUTSIDE * Math.min(half[0] / Math.max(Math.abs(x), 1e-6), half[1] / Math.max(Math.abs(y), 1e-6));
+    return [left + half[0] + reach * x, top + half[1] + reach * y];
   }
 
   /** Arrow at the border of the picture towards an anchor outside; returns its tail. */

@@ -2,12 +2,16 @@
 
 import { CANVAS_OPTIONS } from "../graphics.js";
 import { Ghost } from "./ghost.js";
+import { Gestures } from "./gestures.js";
 import { Labels } from "./labels.js";
+import { toCam } from "./projection.js";
+import { Viewport } from "./viewport.js";
 import { partsOf } from "../transport/api.js";
 
 const MAX_CANVAS_PX = 1600; // longer side; larger canvases cost time without visible benefit
 const VISIBILITY_EVERY_MS = 150;
-const LINE_CSS_PX = 1.7;
+const LINE_CSS_PX = 1.7, THINNEST_PX = 1.2;
+const RESIZED = 1.1; // the canvas is only resized after its size is wrong by this factor: while a view moves it would be costly
 const PASS_DIMMING = 0.65; // ghosts of components that passed are fainter, so that the others stand out
 const NEUTRAL = "#46c4ff", CONTEXT = "#e2e8f0", CONTEXT_ALPHA = 0.5;
 const HATCH_ALPHA = 0.75; // the lines of a hatched ghost cover little
@@ -21,10 +25,11 @@ export class Stage {
   #visibilityMs = -Infinity;
   #place = null;
   #size = null;
-  #free = null;
+  #areas = null;
 
   /**
-   * @param elements {stage, canvas, leaders, labels, obstacles: [bar, notices, actions, card, side]}
+   * @param elements {stage, canvas, leaders, labels, obstacles: [bar, notices, actions, card, side], controls}: neither picture
+   *     nor labels use the room of obstacles; controls lie over the picture, but labels avoid them.
    * @param onPick called with name and part of a component that was pressed in the picture, or null for a press beside all.
    * @param onResize called when everything has to be redrawn.
    */
@@ -40,9 +45,19 @@ export class Stage {
     this.isChanged = true; // whether style, part or window have changed since the last drawing
     this.labelBoxes = new Labels(this.labels, this.leaders, onPick);
     this.calm = matchMedia("(prefers-reduced-motion: reduce)");
+    this.viewport = new Viewport();
+    this.isFollowing = false; // whether the view may follow the parts
+    let before = null;
+    this.gestures = new Gestures(this.stage, this.viewport, {
+      onChange: () => this.moved(),
+      onTap: (event) => {
+        before = [this.style.only, this.style.only_part];
+        this.#pick(event);
+      },
+      onDouble: () => before && this.onPick(...before), // the first of two taps was no choice
+    });
     new ResizeObserver(() => this.measure()).observe(this.stage);
-    for (const one of this.obstacles) new ResizeObserver(() => this.measure()).observe(one);
-    this.canvas.addEventListener("click", (event) => this.#pick(event));
+    for (const one of [...this.obstacles, this.controls]) new ResizeObserver(() => this.measure()).observe(one);
     document.fonts?.ready.then(() => this.labelBoxes.remeasure());
   }
 
@@ -73,17 +88,46 @@ export class Stage {
 
   /** Update the layout after a change of the window. */
   measure() {
-    this.#free = null;
+    this.#areas = null;
     this.isChanged = true;
     this.labelBoxes.remeasure();
     this.onResize();
+  }
+
+  /** Draw again after a change of zoom or position. */
+  moved() {
+    this.isChanged = true;
+    this.#visibilityMs = -Infinity;
+    this.onResize();
+  }
+
+  /** Position of the picture on the stage: CSS px = left + scale * (u + 0.5); null while there is none. */
+  get place() {
+    return this.#place;
+  }
+
+  /** The area that labels may use, CSS px on the stage. */
+  get free() {
+    return this.#areas?.labels ?? null;
+  }
+
+  /** Size of the picture on the screen, CSS px; null while there is none. */
+  get size() {
+    return this.#size;
+  }
+
+  /** Where a point of a part in the model frame is drawn, CSS px on the stage; null where it is not in view. */
+  toScreen(part, point) {
+    const pose = this.#drawn, cam_from_model = pose?.parts[part]?.cam_from_model;
+    const pixel = cam_from_model && pose.lens.project(toCam(cam_from_model, point));
+    return pixel ? [this.#place.left + this.#place.scale * (pixel[0] + 0.5), this.#place.top + this.#place.scale * (pixel[1] + 0.5)] : null;
   }
 
   /** Draw the choice of the player. */
   draw({ frame, pose, guide, isAnnotated }) {
     this.isChanged = false;
     if (!frame) return this.labelBoxes.hide();
-    this.#lay(frame);
+    this.#lay(frame, pose);
     const isReady = this.ghost?.components.length > 0 && this.components !== null;
     const ownPose = isReady && pose && !isAnnotated && frame.width === pose.lens.width && frame.height === pose.lens.height ? pose : null;
     const ownGuide = isReady && guide && frame.width === guide.lens.width ? guide : null;
@@ -96,17 +140,21 @@ export class Stage {
         poses: (ownPose?.parts ?? []).map((one) => ({ cam_from_model: one.cam_from_model, isCritical: one.state === "critical" })),
         guide: ownPose ? null : ownGuide?.guide_cam_from_model ?? null,
         camera: (ownPose ?? ownGuide)?.lens,
-        lineWidth: (LINE_CSS_PX * this.canvas.width) / this.#size.width,
+        lineWidth: Math.max(THINNEST_PX, (LINE_CSS_PX * this.canvas.width) / this.#size.width),
       });
     }
     this.#drawn = ownPose;
+    if (this.viewport.isMoving) {
+      this.isChanged = true;
+      this.onResize();
+    }
     if (!ownPose?.isPosed) return this.labelBoxes.hide();
     const nowMs = performance.now();
     if (nowMs - this.#visibilityMs > VISIBILITY_EVERY_MS) {
       this.#visibilityMs = nowMs;
       this.labelBoxes.setVisibility(this.ghost.visibility());
     }
-    this.labelBoxes.update(ownPose, this.#place, this.#free.labels, this.style, !this.calm.matches);
+    this.labelBoxes.update(ownPose, this.#place, this.#areas.labels, this.style, !this.calm.matches, this.#areas.seen);
   }
 
   #drawn = null;
@@ -161,28 +209,55 @@ export class Stage {
   }
 
   /** Position the canvas for the picture of this frame. */
-  #lay(frame) {
-    const shape = `${frame.width}×${frame.height}`;
-    if (this.#free && this.#shape === shape) return;
-    this.#shape = shape;
-    const whole = this.stage.getBoundingClientRect(), free = freeOf(whole, this.obstacles);
+  #lay(frame, pose) {
+    const { whole, free } = (this.#areas ??= this.#measured());
     const fit = (area) => Math.min(area.width / frame.width, area.height / frame.height);
-    const isRoomy = fit(free) >= ROOMY * fit({ width: whole.width, height: whole.height });
-    const area = isRoomy ? free : { left: 0, top: 0, width: whole.width, height: whole.height };
-    const scale = fit(area), width = frame.width * scale, height = frame.height * scale;
-    const left = area.left + (area.width - width) / 2, top = area.top + (area.height - height) / 2;
+    const isRoomy = this.viewport.isManual || this.isFollowing || fit(free) >= ROOMY * fit(whole), area = isRoomy ? free : whole;
+    const { left, top, scale } = this.viewport.place(frame, area, this.isFollowing ? this.#boxOf(pose, frame) : null, !this.calm.matches);
+    const width = frame.width * scale, height = frame.height * scale, old = this.#place;
+    if (old && old.left === left && old.top === top && old.scale === scale && this.#size.width === width && this.#size.height === height) return;
     Object.assign(this.canvas.style, { left: `${left}px`, top: `${top}px`, width: `${width}px`, height: `${height}px` });
-    const density = Math.min(devicePixelRatio || 1, MAX_CANVAS_PX / Math.max(width, height));
-    const size = [Math.max(1, Math.round(width * density)), Math.max(1, Math.round(height * density))];
-    if (this.ghost) this.ghost.resize(...size);
-    else [this.canvas.width, this.canvas.height] = size;
+    const goal = [frame.width, frame.height].map((side) => side * this.viewport.goalScale);
+    const density = Math.min(devicePixelRatio || 1, MAX_CANVAS_PX / Math.max(...goal)), size = goal.map((side) => Math.max(1, Math.round(side * density)));
+    const ratio = size[0] / this.canvas.width, isSameShape = Math.abs(size[1] / this.canvas.height / ratio - 1) < 0.01;
+    if (!isSameShape || !this.viewport.isMoving || ratio > RESIZED || ratio < 1 / RESIZED) {
+      if (this.ghost) this.ghost.resize(...size);
+      else if (this.canvas.width !== size[0] || this.canvas.height !== size[1]) [this.canvas.width, this.canvas.height] = size;
+    }
     this.#size = { width, height };
     this.#place = { left, top, scale };
-    this.#free = { labels: inset(free, MARGIN_PX) };
-    this.#visibilityMs = -Infinity;
+    // Of the picture only this is seen: the bars cover the rest.
+    this.#areas.seen = {
+      left: Math.max(left, free.left), top: Math.max(top, free.top), right: Math.min(left + width, free.left + free.width),
+      bottom: Math.min(top + height, free.top + free.height),
+    };
+    if (!this.viewport.isMoving) this.#visibilityMs = -Infinity;
   }
 
-  #shape = "";
+  #measured() {
+    const box = this.stage.getBoundingClientRect(), free = freeOf(box, this.obstacles);
+    return { whole: { left: 0, top: 0, width: box.width, height: box.height }, free, labels: inset(freeOf(box, [...this.obstacles, this.controls]), MARGIN_PX) };
+  }
+
+  /** Box around the parts in a frame, px; null without a pose. The station may send the frame smaller than it was tracked. */
+  #boxOf(pose, frame) {
+    const box = { left: Infinity, top: Infinity, right: -Infinity, bottom: -Infinity };
+    for (const [id, { cam_from_model }] of (pose?.parts ?? []).entries()) {
+      const bounds = this.parts?.[id]?.part?.bounds_in_model;
+      if (!cam_from_model || !bounds) continue;
+      for (let k = 0; k < 8; k++) {
+        const pixel = pose.lens.project(toCam(cam_from_model, [bounds[k & 1][0], bounds[(k >> 1) & 1][1], bounds[k >> 2][2]]));
+        if (!pixel) continue;
+        box.left = Math.min(box.left, pixel[0]);
+        box.right = Math.max(box.right, pixel[0]);
+        box.top = Math.min(box.top, pixel[1]);
+        box.bottom = Math.max(box.bottom, pixel[1]);
+      }
+    }
+    if (!(box.right > box.left)) return null;
+    const scale = frame.width / pose.lens.width;
+    return { left: box.left * scale, top: box.top * scale, right: box.right * scale, bottom: box.bottom * scale };
+  }
 
   #pick(event) {
     if (!this.#drawn || !this.ghost) return;

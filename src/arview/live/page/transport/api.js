@@ -1,5 +1,7 @@
 // Requests to the server, and its error messages.
 
+import { t } from "../texts/texts.js";
+
 /** An error response of the server, or no response at all (code "offline"). */
 export class Refusal extends Error {
   constructor(status, code, message, waitS = 0) {
@@ -26,7 +28,7 @@ export async function ask(path, { method = "GET", json, body, headers = {}, keep
     });
   } catch (error) {
     if (signal?.aborted) throw error;
-    throw new Refusal(0, "offline", "the station does not respond");
+    throw new Refusal(0, "offline", t("link.silent"));
   }
   if (answer.ok) return answer;
   let document = {};
@@ -34,7 +36,7 @@ export async function ask(path, { method = "GET", json, body, headers = {}, keep
     document = await answer.json();
   } catch { /* an error that arview did not send has no JSON body */ }
   throw new Refusal(
-    answer.status, document.error ?? "error", document.message ?? `the station responded with status ${answer.status}`,
+    answer.status, document.error ?? "error", document.message ?? t("link.status", { status: answer.status }),
     Number(answer.headers.get("Retry-After")) || 0,
   );
 }

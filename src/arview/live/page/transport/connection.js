@@ -3,6 +3,7 @@
 import { Refusal, control, getModel, getPart, partsOf } from "./api.js";
 import { JpegLink } from "./jpeg.js";
 import { NoWebrtc, WebrtcLink } from "./webrtc.js";
+import { t } from "../texts/texts.js";
 
 export const CHOICES = ["auto", "poses", "video", "jpeg"];
 const FIRST_PAUSE_S = 1, LONGEST_PAUSE_S = 15, LOADING_PAUSE_S = 1, BUSY_PAUSE_S = 4;
@@ -16,7 +17,7 @@ export class Connection {
   #part = null;
   #models = new Map(); // GLB by the hash of the model
   #shownModels = "";
-  #isWebrtcBlocked = false;
+  #noWebrtc = null; // why WebRTC does not work here: see NoWebrtc
   #isOver = false;
   #skipPause = () => {};
   #abort = new AbortController();
@@ -34,9 +35,9 @@ export class Connection {
     return this.choice === "video" || (!this.hasGhost && this.choice !== "poses") ? "video" : "poses";
   }
 
-  /** Whether the automatic choice has fallen back from WebRTC to JPEG. */
-  get hasFallenBack() {
-    return this.#isWebrtcBlocked && this.choice !== "jpeg";
+  /** Why the automatic choice has fallen back from WebRTC to JPEG, see NoWebrtc; null if it has not. */
+  get fallback() {
+    return this.choice === "jpeg" ? null : this.#noWebrtc;
   }
 
   /** Stay connected until `end`. */
@@ -51,13 +52,13 @@ export class Connection {
       } catch (error) {
         if (this.#isOver) return;
         if (error instanceof NoWebrtc && this.choice === "auto") {
-          this.#isWebrtcBlocked = true;
+          this.#noWebrtc = error.reason;
           continue;
         }
         if (!(error instanceof Refusal || error instanceof NoWebrtc || error.name === "AbortError")) console.error(error);
         if (error.code === "loading") this.#phase("loading", error.message, LOADING_PAUSE_S);
         else if (error.code === "busy") this.#phase("busy", error.message.replace(/^busy: /, ""), (pauseS = BUSY_PAUSE_S));
-        else if (error.code === "no_token") this.#phase("denied", "arview was restarted: scan the code at the station again", LONGEST_PAUSE_S);
+        else if (error.code === "no_token") this.#phase("denied", t("message.denied.text"), LONGEST_PAUSE_S);
         else this.#phase("retrying", error.message, Math.max(pauseS, error.waitS ?? 0));
         if (error.code === "loading") pauseS = 0.5;
       }
@@ -70,7 +71,7 @@ export class Connection {
   choose(choice) {
     const previous = this.choice;
     this.choice = choice;
-    this.#isWebrtcBlocked = false;
+    this.#noWebrtc = null;
     if (!this.link || choice === previous) return;
     const kind = choice === "jpeg" ? "jpeg" : "webrtc";
     if (kind === this.link.kind) this.ask({ mode: this.mode });
@@ -79,7 +80,7 @@ export class Connection {
 
   /** Send a Control request; returns the error message, or "" on success. */
   async ask(request) {
-    if (!this.link?.client) return "there is no connection to the station";
+    if (!this.link?.client) return t("link.gone");
     try {
       this.#handleStatus(await control(this.link.client, request));
       return "";
@@ -151,8 +152,8 @@ export class Connection {
       onFrame: this.events.onFrame,
       onEnd: this.#ended,
     };
-    const isJpeg = this.choice === "jpeg" || this.#isWebrtcBlocked;
-    this.#phase("connecting", isJpeg ? "" : "by WebRTC");
+    const isJpeg = this.choice === "jpeg" || this.#noWebrtc !== null;
+    this.#phase("connecting", isJpeg ? "" : t("why.webrtc"));
     const link = isJpeg ? new JpegLink(isPhone, events) : new WebrtcLink(isPhone, this.video, events);
     const { choice } = this;
     this.link = null;
@@ -168,7 +169,7 @@ export class Connection {
     this.events.onOpen(link);
     const reason = await ended;
     this.link = null;
-    if (reason === MUTE) throw new NoWebrtc("pictures do not arrive by WebRTC");
+    if (reason === MUTE) throw new NoWebrtc("blocked");
     return reason;
   }
 

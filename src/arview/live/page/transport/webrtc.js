@@ -3,13 +3,19 @@
 import { CANVAS_OPTIONS } from "../graphics.js";
 import { ask, join, leave } from "./api.js";
 import { watchFrames } from "../camera.js";
+import { t } from "../texts/texts.js";
 import { drawStrip, readStamp, stripHeight } from "./stamp.js";
 
 const GATHER_MS = 1500, CONNECT_MS = 9000, SILENT_MS = 5000, RTT_EVERY_MS = 2000;
 const BITRATE = 8_000_000;
 
-/** The network blocks WebRTC, or the browser does not support it. */
-export class NoWebrtc extends Error {}
+/** WebRTC does not work here; the cause is "unsupported" by the browser, "disagree" (no common codec) or "blocked" by the network. */
+export class NoWebrtc extends Error {
+  constructor(cause) {
+    super(t(`link.${cause}`));
+    this.reason = cause;
+  }
+}
 
 export class WebrtcLink {
   kind = "webrtc";
@@ -29,12 +35,12 @@ export class WebrtcLink {
 
   /** Connect; throws NoWebrtc or a Refusal. */
   async open(mode, signal) {
-    if (!globalThis.RTCPeerConnection) throw new NoWebrtc("this browser does not support WebRTC");
+    if (!globalThis.RTCPeerConnection) throw new NoWebrtc("unsupported");
     const peer = (this.peer = new RTCPeerConnection({ iceServers: [] }));
     try {
       const channel = peer.createDataChannel("arview", { ordered: false, maxRetransmits: 0 });
       channel.addEventListener("message", (event) => this.#process(JSON.parse(event.data)));
-      channel.addEventListener("close", () => this.#end("the connection was closed"));
+      channel.addEventListener("close", () => this.#end(t("link.closed")));
       this.#addVideo(peer);
       await peer.setLocalDescription(await peer.createOffer());
       await gathered(peer);
@@ -46,12 +52,12 @@ export class WebrtcLink {
     } catch (error) {
       this.close();
       if (error.code === "bad_offer" || error instanceof DOMException && error.name !== "AbortError") {
-        throw new NoWebrtc(`the browser and the station cannot agree on WebRTC: ${error.message}`);
+        throw new NoWebrtc("disagree");
       }
       throw error;
     }
     peer.addEventListener("connectionstatechange", () => {
-      if (["failed", "closed"].includes(peer.connectionState)) this.#end("the connection was lost");
+      if (["failed", "closed"].includes(peer.connectionState)) this.#end(t("link.lost"));
     });
     this.#receivedMs = performance.now();
     this.#timer = setInterval(() => this.#watch(), RTT_EVERY_MS);
@@ -132,7 +138,7 @@ export class WebrtcLink {
       } catch (error) {
         return this.#end(error.message);
       }
-      return this.#end("no more data arrives through the connection");
+      return this.#end(t("link.no_data"));
     }
     const report = await this.peer.getStats().catch(() => []);
     for (const entry of report.values?.() ?? []) {
@@ -163,7 +169,7 @@ function gathered(peer) {
 
 function connected(peer, channel) {
   return new Promise((resolve, reject) => {
-    const timer = setTimeout(() => reject(new NoWebrtc("no WebRTC connection within 9 s")), CONNECT_MS);
+    const timer = setTimeout(() => reject(new NoWebrtc("blocked")), CONNECT_MS);
     channel.addEventListener("open", () => {
       clearTimeout(timer);
       resolve();
@@ -171,7 +177,7 @@ function connected(peer, channel) {
     peer.addEventListener("connectionstatechange", () => {
       if (peer.connectionState !== "failed") return;
       clearTimeout(timer);
-      reject(new NoWebrtc("this network blocks WebRTC"));
+      reject(new NoWebrtc("blocked"));
     });
   });
 }
