@@ -44,9 +44,10 @@ export function allNotices({ status, part }, { hasGhost, fallback }) {
   if (status?.feed && ["reconnecting", "frozen"].includes(status.feed.state) && !shown.some((one) => one.code.startsWith("source_"))) {
     shown.push({ level: "error", text: status.feed.text });
   }
+  const isTold = shown.some((one) => one.code === "inspection_future");
   const inspections = part ? partsOf(part).map((one) => one.inspection).filter(Boolean) : [];
   const ahead = Math.max(0, ...inspections.map(({ created }) => (Date.parse(created) - Date.now()) / 1000), ...inspections.map(({ age_s }) => -age_s));
-  if (ahead > FUTURE_S) shown.push({ code: "inspection_future", level: "warning", text: t("notice.future", { ahead: spanText(ahead) }) });
+  if (ahead > FUTURE_S && !isTold) shown.push({ code: "inspection_future", level: "warning", text: t("notice.future", { ahead: spanText(ahead) }) });
   for (const { note } of inspections) if (note) shown.push({ level: "warning", text: note });
   if (!hasGhost) shown.push({ level: "warning", text: t("notice.no_webgl") });
   if (fallback === "unsupported") shown.push({ level: "warning", text: t("notice.no_webrtc") });

@@ -30,6 +30,7 @@ const PATHS = {
   list: '<g fill="none" stroke="currentColor" stroke-width="2.6"><path d="M9 6h12M9 12h12M9 18h12M3.5 6h1M3.5 12h1M3.5 18h1"/></g>',
   view: '<g fill="none" stroke="currentColor" stroke-width="2.4"><path d="M4 7h9M19 7h1M4 17h1M11 17h9"/><circle cx="16" cy="7" r="2.8"/><circle cx="8" cy="17" r="2.8"/></g>',
   close: '<path d="M5 5l14 14M19 5L5 19" fill="none" stroke="currentColor" stroke-width="2.8"/>',
+  pen: '<path d="M4 20l1-5L16 4l4 4L9 19zM14 6l4 4" fill="none" stroke="currentColor" stroke-width="2.4" stroke-linejoin="round"/>',
   plus: '<path d="M12 4v16M4 12h16" fill="none" stroke="currentColor" stroke-width="2.8"/>',
   minus: '<path d="M4 12h16" fill="none" stroke="currentColor" stroke-width="2.8"/>',
   fit: '<g fill="none" stroke="currentColor" stroke-width="2.6"><path d="M9 4H4v5M15 4h5v5M20 15v5h-5M9 20H4v-5"/><rect x="9" y="9" width="6" height="6"/></g>',

@@ -16,6 +16,7 @@ import { Player } from "./player.js";
 import { Specimens, reasonOf, summaryOf } from "./specimens.js";
 import { Sheet } from "./sheet.js";
 import { Stage } from "./scene/stage.js";
+import { mountJob } from "./job/job.js";
 import { partsOf } from "./transport/api.js";
 import { Message, Notices, StatusBar, Toast } from "./status.js";
 import { save, share } from "./lists/share.js";
@@ -165,7 +166,7 @@ function note({ frame, pose, guide, isAnnotated }, isSame) {
   }
   const detail = { id: frame?.id ?? null, pose, isAnnotated, takenMs: frame?.takenMs ?? null, drawnMs: nowMs };
   document.dispatchEvent(new CustomEvent("arview:drawn", { detail }));
-  tell("drawn", detail);
+  tell("drawn", pose);
 }
 
 // --- status and figures ------------------------------------------------------------------------------
@@ -402,8 +403,7 @@ const host = {
     suggestion: state.part ? partsOf(state.part)[part]?.part?.serial : "", ...more,
   }),
 };
-// job: mounted here
-void host;
+mountJob(host);
 
 // --- start and end ------------------------------------------------------------------------------
 

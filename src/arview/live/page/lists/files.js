@@ -24,11 +24,14 @@ export class Files {
     if (this.#isBusy) return;
     this.#isBusy = true;
     try {
-      const [recordings, jobs, kept] = await Promise.all([asked("/api/recordings", "recordings"), asked("/api/jobs", "jobs"), snapshots()]);
+      const [recordings, jobs, there, kept] = await Promise.all([
+        asked("/api/recordings", "recordings"), asked("/api/jobs", "jobs"), asked("/api/snapshots", "snapshots"), snapshots(),
+      ]);
       const refresh = make("button", "wide", [t("files.refresh")], { id: "refresh-files" });
       refresh.addEventListener("click", () => this.refresh());
       this.box.replaceChildren(
         ...this.#list("recordings", recordings, (one) => this.#recording(one)),
+        ...(there.length ? this.#list("station_snapshots", there, (one) => this.#stationSnapshot(one)) : []),
         ...this.#list("snapshots", kept, (one) => this.#snapshot(one)),
         ...this.#list("reports", jobs, (one) => this.#report(one)),
         refresh,
@@ -48,12 +51,17 @@ export class Files {
 
   #recording({ number, name, bytes, seconds, created, is_recovered }) {
     const address = `/api/recordings/${number}`;
-    const about = [moment(created), clock(seconds), size(bytes), ...(is_recovered ? [t("files.recovered")] : [])];
+    const about = [moment(created), ...(seconds === null ? [] : [clock(seconds)]), size(bytes), ...(is_recovered ? [t("files.recovered")] : [])];
     return this.#row(name, about, null, address, address, "video/mp4");
   }
 
   #snapshot({ name, bytes, created, blob }) {
     return this.#row(name, [moment(created), size(bytes)], null, () => URL.createObjectURL(blob), blob, "image/png");
+  }
+
+  #stationSnapshot({ name, bytes, created }) {
+    const address = `/api/snapshots/${encodeURIComponent(name)}`;
+    return this.#row(name, [moment(created), size(bytes)], null, address, address, "image/png");
   }
 
   #report({ id, part, serial, created, stage, verdict, photos, parent }) {

@@ -215,6 +215,11 @@ export class Stage {
     const isRoomy = this.viewport.isManual || this.isFollowing || fit(free) >= ROOMY * fit(whole), area = isRoomy ? free : whole;
     const { left, top, scale } = this.viewport.place(frame, area, this.isFollowing ? this.#boxOf(pose, frame) : null, !this.calm.matches);
     const width = frame.width * scale, height = frame.height * scale, old = this.#place;
+    // Of the picture only this is seen: the bars cover the rest.
+    this.#areas.seen = {
+      left: Math.max(left, free.left), top: Math.max(top, free.top), right: Math.min(left + width, free.left + free.width),
+      bottom: Math.min(top + height, free.top + free.height),
+    };
     if (old && old.left === left && old.top === top && old.scale === scale && this.#size.width === width && this.#size.height === height) return;
     Object.assign(this.canvas.style, { left: `${left}px`, top: `${top}px`, width: `${width}px`, height: `${height}px` });
     const goal = [frame.width, frame.height].map((side) => side * this.viewport.goalScale);
@@ -226,11 +231,6 @@ export class Stage {
     }
     this.#size = { width, height };
     this.#place = { left, top, scale };
-    // Of the picture only this is seen: the bars cover the rest.
-    this.#areas.seen = {
-      left: Math.max(left, free.left), top: Math.max(top, free.top), right: Math.min(left + width, free.left + free.width),
-      bottom: Math.min(top + height, free.top + free.height),
-    };
     if (!this.viewport.isMoving) this.#visibilityMs = -Infinity;
   }
 

@@ -198,6 +198,7 @@ export default {
 
   "files.recordings": "Aufnahmen",
   "files.snapshots": "Fotos dieses Geräts",
+  "files.station_snapshots": "Fotos an der Station",
   "files.reports": "Berichte",
   "files.no_recordings": "Noch keine Aufnahmen",
   "files.no_snapshots": "Noch keine Fotos",

@@ -198,6 +198,7 @@ export default {
 
   "files.recordings": "Recordings",
   "files.snapshots": "Snapshots of this device",
+  "files.station_snapshots": "Snapshots at the station",
   "files.reports": "Reports",
   "files.no_recordings": "No recordings yet",
   "files.no_snapshots": "No snapshots yet",
