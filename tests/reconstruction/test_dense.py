@@ -275,7 +275,8 @@ def test_score_counts_what_is_missing_and_what_is_off(scene: SparseModel) -> Non
 
 def test_torch_finds_the_same_surface(scene: SparseModel, nominal: Cad, cloud: DenseCloud, monkeypatch) -> None:
     # What a GPU does, on the processor: the same pixels get the same elements, but for ties and rounding.
-    pytest.importorskip("torch")
+    pytest.importorskip("torch", reason="torch is not installed: tools/setup")
+    pytest.importorskip("kornia", reason="kornia is not installed: tools/setup")
     monkeypatch.setattr("arview.reconstruction.dense.depth.torch_device", lambda device: "cpu")
     other = reconstruct_dense(scene, TINY, nominal)
     apart, _ = cKDTree(other.points).query(cloud.points)

@@ -86,7 +86,7 @@ A video or PDF that cannot be made is a warning: the verdict stands without it."
 )
 @click.option("--threads", type=click.IntRange(min=0), default=0, metavar="N", help="Threads; default: all cores.")
 @click.option("--device", default="auto", show_default=True, metavar="auto|cpu|cuda[:N]",
-              help="Device for dense matching.")  # fmt: skip
+              help="Device for features, matching and the dense cloud, see `arview reconstruct --help`.")  # fmt: skip
 @click.option("--force", is_flag=True, help="Repeat all stages, even those already finished in OUT.")
 @UNIT
 def inspect(

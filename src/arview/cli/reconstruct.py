@@ -72,7 +72,8 @@ reconstruction.json. An interrupted run resumes where it stopped; --force starts
 @click.option("--seed", type=int, default=0, show_default=True, help="The same seed gives the same cloud.")
 @click.option("--threads", type=click.IntRange(min=0), default=0, metavar="N", help="Threads; default: all cores.")
 @click.option("--device", default="auto", show_default=True, metavar="auto|cpu|cuda[:N]",
-              help="Device for dense matching; auto takes a CUDA GPU if torch (arview[gpu]) finds one.")  # fmt: skip
+              help="Device for features, matching and the dense cloud; auto takes a CUDA GPU if torch (arview[gpu]) "
+              "finds one.")  # fmt: skip
 @click.option("--force", is_flag=True, help="Repeat all stages, even those already finished in OUT.")
 @UNIT
 def reconstruct(
@@ -114,7 +115,7 @@ def reconstruct(
     part = load_part(part_path, unit) if part_path else None
     options = run.ReconstructOptions(
         video=VideoIntakeOptions(max_frames=max_frames),
-        sparse=SparseOptions(seed=seed, threads=threads),
+        sparse=SparseOptions(seed=seed, threads=threads, device=device),
         sources=_sources(boards, tags, bars, scale_file, rig),
         dense=DenseOptions(seed=seed, band_mm=band, threads=threads, device=device),
         poses=Path(poses) if poses else None,

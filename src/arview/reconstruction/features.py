@@ -1,4 +1,4 @@
-"""SIFT features of the photos, by OpenCV."""
+"""SIFT features of the photos, by OpenCV, or by the same method on a GPU."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arview.core.progress import StepProgress
+from arview.reconstruction.gpu.sift import KeyPoints, sift
 from arview.reconstruction.intake import read_photo
 from arview.reconstruction.intake.masks import read_mask
 from arview.reconstruction.types import Photo
@@ -53,11 +54,14 @@ _NONE = Features(
 
 
 def find_features(
-    image: NDArray[np.uint8], options: FeatureOptions | None = None, mask: NDArray[np.bool_] | None = None
+    image: NDArray[np.uint8],
+    options: FeatureOptions | None = None,
+    mask: NDArray[np.bool_] | None = None,
+    device: str | None = None,
 ) -> Features:
     """SIFT features of an (H,W,3) RGB picture, spread over it, where the ``mask`` (H,W) is True.
 
-    ``enable_precise_upscale`` is required: without it OpenCV's key points are shifted by a quarter of a pixel.
+    They are found by OpenCV, or on a torch ``device``; both find the same but for rounding.
     """
     options = options or FeatureOptions()
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
@@ -67,18 +71,14 @@ def find_features(
         size = (round(width / reduction), round(height / reduction))
         grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
     scale = np.array([width / grey.shape[1], height / grey.shape[0]], dtype=np.float32)
-    sift = cv2.SIFT_create(  # type: ignore[attr-defined]
-        nfeatures=options.max_features,
-        contrastThreshold=options.contrast_threshold,
-        enable_precise_upscale=True,
-    )
     size = (grey.shape[1], grey.shape[0])
     allowed = None if mask is None else cv2.resize(mask.astype(np.uint8) * 255, size, interpolation=cv2.INTER_NEAREST)
-    keys, sums = sift.detectAndCompute(grey, allowed)
-    if not keys:
+    if device is None:
+        points, sizes, strength, sums = _opencv_sift(grey, options, allowed)
+    else:
+        points, sizes, strength, sums = sift(grey, options.max_features, options.contrast_threshold, allowed, device)
+    if len(points) == 0:
         return _NONE
-    points = np.array([key.pt for key in keys], dtype=np.float32)
-    strength = np.array([key.response for key in keys])
     order = _spread(points, strength, grey.shape)[: options.max_features]
     roots = np.sqrt(sums / np.maximum(sums.sum(axis=1, keepdims=True), 1e-9))
     roots /= np.maximum(np.linalg.norm(roots, axis=1, keepdims=True), 1e-9)
@@ -87,9 +87,25 @@ def find_features(
     return Features(
         points_px=points_px,
         descriptors=np.ascontiguousarray(roots[order], dtype=np.float32),
-        sizes_px=np.array([key.size for key in keys], dtype=np.float32)[order] * scale.mean(),
+        sizes_px=sizes[order] * scale.mean(),
         colors=image[rows, columns],
     )
+
+
+def _opencv_sift(grey: NDArray[np.uint8], options: FeatureOptions, allowed: NDArray[np.uint8] | None) -> KeyPoints:
+    """Key points of OpenCV.
+
+    ``enable_precise_upscale`` is required: without it OpenCV's key points are shifted by a quarter of a pixel.
+    """
+    detector = cv2.SIFT_create(  # type: ignore[attr-defined]
+        nfeatures=options.max_features,
+        contrastThreshold=options.contrast_threshold,
+        enable_precise_upscale=True,
+    )
+    keys, sums = detector.detectAndCompute(grey, allowed)
+    points = np.array([key.pt for key in keys], dtype=np.float32).reshape(-1, 2)
+    sizes = np.array([key.size for key in keys], dtype=np.float32)
+    return KeyPoints(points, sizes, np.array([key.response for key in keys]), sums)
 
 
 def _spread(points: NDArray[np.float32], strength: NDArray[np.float64], shape: tuple[int, ...]) -> NDArray[np.intp]:
@@ -104,17 +120,23 @@ def _spread(points: NDArray[np.float32], strength: NDArray[np.float64], shape: t
 
 
 def find_all_features(
-    photos: Sequence[Photo], options: FeatureOptions, threads: int, progress: StepProgress | None = None
+    photos: Sequence[Photo],
+    options: FeatureOptions,
+    threads: int,
+    progress: StepProgress | None = None,
+    device: str | None = None,
 ) -> list[Features]:
     """Features of every photo, in their order, outside of what its mask leaves out; ``threads`` photos at a time.
+
+    On a torch ``device`` two at a time, so that one is read while the other is worked on.
 
     Raises:
         InputError: a photo cannot be read.
     """
     found: list[Features] = []
-    with ThreadPoolExecutor(threads) as pool:
+    with ThreadPoolExecutor(threads if device is None else 2) as pool:
         for features in pool.map(
-            lambda photo: find_features(read_photo(photo.path), options, read_mask(photo)), photos
+            lambda photo: find_features(read_photo(photo.path), options, read_mask(photo), device), photos
         ):
             found.append(features)
             if progress:

@@ -9,11 +9,14 @@ from numpy.typing import NDArray
 from arview.core.kernel import kernel
 from arview.geometry import Array
 from arview.reconstruction.features import Descriptors, Features
+from arview.reconstruction.gpu.matching import MatchLimits, Side, match_by_appearance, match_on_lines
 
 Matches = NDArray[np.uint32]
 
 MAX_RATIO = 0.8  # of the angles to the best and the second best descriptor; Lowe 2004
 MAX_ANGLE_RAD = 0.7  # between descriptors of the same place
+MAX_SIZE_RATIO = 2.5  # of two key points along epipolar lines
+_LIMITS = MatchLimits(MAX_RATIO, MAX_ANGLE_RAD, MAX_SIZE_RATIO)
 _BLOCK = 512  # rows of similarities computed at a time, which fit into the processor's cache
 
 
@@ -39,10 +42,15 @@ def _best(
         partner[row], best[row], second[row] = at, high, next_high
 
 
-def match_descriptors(ones: Descriptors, others: Descriptors) -> Matches:
-    """(M,2) rows of ``ones`` and ``others`` that are mutual nearest neighbours and pass the ratio test."""
+def match_descriptors(ones: Descriptors, others: Descriptors, device: str | None = None) -> Matches:
+    """(M,2) rows of ``ones`` and ``others`` that are mutual nearest neighbours and pass the ratio test.
+
+    On the processor, or on a torch ``device``.
+    """
     if len(ones) < 2 or len(others) < 2:
         return np.zeros((0, 2), np.uint32)
+    if device is not None:
+        return match_by_appearance(ones, others, _LIMITS, device)
     partner = np.empty(len(ones), np.int32)
     best, second = np.empty(len(ones), np.float32), np.empty(len(ones), np.float32)
     column_best, column_row = np.full(len(others), -2.0, np.float32), np.zeros(len(others), np.int32)
@@ -114,7 +122,7 @@ def _match_along(
                     j = cells[k]
                     if abs(a * other_px[j, 0] + b * other_px[j, 1] + c) > band_px:
                         continue
-                    if sizes[i] > 2.5 * other_sizes[j] or other_sizes[j] > 2.5 * sizes[i]:
+                    if sizes[i] > MAX_SIZE_RATIO * other_sizes[j] or other_sizes[j] > MAX_SIZE_RATIO * sizes[i]:
                         continue
                     value = np.float32(0.0)
                     for d in range(descriptors.shape[1]):
@@ -133,7 +141,12 @@ def _match_along(
 
 
 def match_along_lines(
-    rays: tuple[Array, Array], focal_px: float, features: tuple[Features, Features], essential: Array, band_px: float
+    rays: tuple[Array, Array],
+    focal_px: float,
+    features: tuple[Features, Features],
+    essential: Array,
+    band_px: float,
+    device: str | None = None,
 ) -> Matches:
     """Match two photos whose relative pose is known, along the epipolar lines only.
 
@@ -145,7 +158,11 @@ def match_along_lines(
         features: of both photos.
         essential: (3,3) maps a ray of the first photo to its line in the second.
         band_px: half width of the band around the line.
+        device: torch device; None for the processor's kernel.
     """
+    if device is not None and min(len(one) for one in features) > 0:
+        one, other = (Side(side.descriptors, side.sizes_px, ray) for side, ray in zip(features, rays, strict=True))
+        return match_on_lines((one, other), focal_px, essential, band_px, _LIMITS, device)
     there = _along_one_way(rays, focal_px, features, essential, band_px)
     back = _along_one_way(rays[::-1], focal_px, features[::-1], essential.T.copy(), band_px)
     rows = np.flatnonzero(there >= 0)

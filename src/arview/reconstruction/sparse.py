@@ -33,6 +33,7 @@ from arview.reconstruction.colmap import (
 )
 from arview.reconstruction.covariance import pose_covariance
 from arview.reconstruction.features import FeatureOptions, Features, find_all_features
+from arview.reconstruction.gpu.device import torch_device
 from arview.reconstruction.groups import GroupOptions, linked_groups
 from arview.reconstruction.matching import Matches, epipolar_inliers, match_along_lines, match_descriptors
 from arview.reconstruction.still import StillOptions, moved_matches, still_features, still_remark, without
@@ -63,6 +64,7 @@ class SparseOptions:
     min_angle_deg: float = 1.5  # between two rays to a point; smaller angles do not determine depth
     seed: int = 0
     threads: int = 0  # 0: all cores
+    device: str = "auto"  # of features and matching: CUDA where torch finds it; cpu, or a torch device
 
 
 def reconstruct_sparse(
@@ -158,7 +160,9 @@ def _moving_features(
     photos: Sequence[Photo], options: SparseOptions, threads: int, tell: Progress
 ) -> tuple[list[Features], list[str]]:
     """Features of all photos without those that stand still in the picture, and what is said of these."""
-    features = find_all_features(photos, options.features, threads, lambda i, n: tell("features", i, n))
+    features = find_all_features(
+        photos, options.features, threads, lambda i, n: tell("features", i, n), torch_device(options.device)
+    )
     still = still_features(features, options.still, threads)
     remark = still_remark(features, still, options.still)
     kept = [without(one, dropped) for one, dropped in zip(features, still, strict=True)]
@@ -175,11 +179,12 @@ def _match_by_appearance(
 
     Before a still background, matches that move by less than ``min_move_px`` are left out.
     """
+    device = torch_device(options.device)
 
     def match(pair: Pair) -> Matches:
         one, other = (features[index] for index in pair)
         count = options.first_features
-        matches = match_descriptors(one.descriptors[:count], other.descriptors[:count])
+        matches = match_descriptors(one.descriptors[:count], other.descriptors[:count], device)
         matches = moved_matches(one, other, matches, min_move_px)
         return epipolar_inliers(one, other, matches, options.max_epipolar_px)
 
@@ -308,13 +313,15 @@ def _match_along_lines(
         for index, camera in cameras.items()
     }
 
+    device = torch_device(options.device)
+
     def match(pair: Pair) -> Matches:
         i, j = pair
         second_from_first = poses[j] @ invert(poses[i])
         essential = skew(second_from_first[:3, 3]) @ second_from_first[:3, :3]
         focal = 0.5 * (cameras[i].fx + cameras[j].fx)
         pair_of = (features[i], features[j])
-        matches = match_along_lines((rays[i], rays[j]), focal, pair_of, essential, options.band_px)
+        matches = match_along_lines((rays[i], rays[j]), focal, pair_of, essential, options.band_px, device)
         return moved_matches(*pair_of, matches, min_move_px)
 
     chosen = _pairs_in_common_view(model, poses)

@@ -35,7 +35,7 @@ class InspectJob:
     max_frames: int = 60  # frames of a video that are used as photos
     seed: int = 0  # the same seed gives the same result
     threads: int = 0  # threads of the reconstruction; 0: all cores
-    device: str = "auto"  # device of dense matching
+    device: str = "auto"  # device of features, matching and the dense cloud
     makes_pdf: bool = True
     compares_halves: bool = True  # measure two halves of the photos apart and compare them
 

@@ -65,7 +65,7 @@ def prepare(job: InspectJob, folder: Path) -> Prepared:
     threads, seed = job.threads, job.seed
     reconstruct = ReconstructOptions(
         video=VideoIntakeOptions(max_frames=job.max_frames),
-        sparse=SparseOptions(seed=seed, threads=threads),
+        sparse=SparseOptions(seed=seed, threads=threads, device=job.device),
         sources=load_scale_file(job.scale_file) if job.scale_file else ScaleSources(),
         dense=DenseOptions(seed=seed, threads=threads, device=job.device),
         poses=Path(job.sparse) if job.sparse else None,

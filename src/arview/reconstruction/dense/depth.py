@@ -21,8 +21,9 @@ from arview.reconstruction.dense.kernels import PARALLAX, Problem, make_scratch
 from arview.reconstruction.dense.options import DenseOptions
 from arview.reconstruction.dense.patchmatch import NEIGHBOURS, sweep, try_hypotheses
 from arview.reconstruction.dense.polish import polish
-from arview.reconstruction.dense.torch_search import search_torch, torch_device
+from arview.reconstruction.dense.torch_search import search_torch
 from arview.reconstruction.dense.views import Cad, DenseView, Floats, Planes, cad_planes, relative_pose, sparse_planes
+from arview.reconstruction.gpu.device import torch_device
 from arview.reconstruction.types import SparseModel
 
 STEPS = (4, 2)

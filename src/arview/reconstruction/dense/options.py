@@ -33,7 +33,7 @@ class DenseOptions:
         normal_angle_deg: … and their normals differ by less than this.
         grazing_deg: surfaces seen at a larger angle from their normal are not used.
         threads: photos worked on at a time; 0 for one per core.
-        device: where PatchMatch runs: ``auto`` takes CUDA if torch finds it; else ``cpu`` or a torch device.
+        device: where PatchMatch runs: ``auto`` takes CUDA if torch and kornia find it; else ``cpu`` or a torch device.
         seed: of the random hypotheses; the same seed gives the same cloud.
     """
 

@@ -1,18 +1,16 @@
-"""PatchMatch for GPUs: the hypotheses, costs and random numbers of `patchmatch`, for all pixels at once in torch.
+"""PatchMatch for GPUs: hypotheses, costs and random numbers of `patchmatch`, for all pixels at once in torch.
 
 What the numba kernels do pixel by pixel is done here for all pixels of one colour of the checkerboard together. Results
-agree to float32 rounding, so both give the same depth maps except for ties.
+agree to float32 rounding, so both give the same depth maps except for ties. kornia samples the warped windows.
 """
 
 from __future__ import annotations
 
-import importlib.util
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.errors import InputError
 from arview.reconstruction.dense.kernels import (
     BEST,
     COLOR_SCALE,
@@ -35,36 +33,10 @@ from arview.reconstruction.dense.kernels import (
 )
 from arview.reconstruction.dense.patchmatch import NEIGHBOURS
 from arview.reconstruction.dense.views import Planes
+from arview.reconstruction.gpu.device import device_memory
 
 _CHUNK = 1 << 17
 """Pixels processed at a time: a window of 40 float32 for each takes 20 MB, and there are about ten such arrays."""
-
-
-def torch_device(device: str) -> str | None:
-    """The torch device that ``device`` means, or None for the numba kernels.
-
-    Args:
-        device: ``auto`` (CUDA if torch finds it), ``cpu``, or a torch device such as ``cuda`` or ``cuda:1``.
-
-    Raises:
-        InputError: torch is not installed, or cannot use the device.
-    """
-    if device == "cpu" or (device == "auto" and importlib.util.find_spec("torch") is None):
-        return None
-    try:
-        import torch
-    except ImportError:
-        raise InputError(
-            f"device {device}: torch is not installed; pip install 'arview[gpu]', or use --device cpu"
-        ) from None
-    if device == "auto":
-        return "cuda" if torch.cuda.is_available() else None
-    try:
-        torch.zeros(1, device=device).cpu()
-    except (RuntimeError, AssertionError, NotImplementedError) as error:
-        reason = str(error).splitlines()[0]
-        raise InputError(f"device {device}: torch cannot use it ({reason}); use --device auto or cpu") from None
-    return device
 
 
 def search_torch(
@@ -84,9 +56,7 @@ def search_torch(
         seed: of the random numbers.
         device: torch device.
     """
-    import torch
-
-    with torch.no_grad():
+    with device_memory(device):
         search = _Search(problem, is_dense, device)
         search.try_hypotheses(given, spread, randoms, low, high, seed)
         for turn, (step_w, step_tilt) in enumerate(steps):
@@ -101,8 +71,9 @@ class _Search:
 
     def __init__(self, problem: Problem, is_dense: bool, device: str) -> None:
         import torch
+        from kornia.geometry.transform import remap
 
-        self.torch = torch
+        self.torch, self.remap = torch, remap
         self.device = device
         self.grey, self.region = self._on_device(problem.grey), self._on_device(problem.region) > 0
         self.pixels, self.maps = self._on_device(problem.pixels), self._on_device(problem.maps)
@@ -175,12 +146,8 @@ class _Search:
             inside &= (z > 0) & (p >= 0) & (q >= 0) & (p <= (width - 2) * z) & (q <= (height - 2) * z)
         p, q, z = (f[0][:, None] + f[1][:, None] * self.dx + f[2][:, None] * self.dy for f in forms)
         p, q = p / z, q / z
-        column, row = p.nan_to_num().clamp(0, width - 2).long(), q.nan_to_num().clamp(0, height - 2).long()
-        fu, fv = p - column, q - row
-        at = first + row * width + column
-        top = self.pixels[at] + fu * (self.pixels[at + 1] - self.pixels[at])
-        low = self.pixels[at + width] + fu * (self.pixels[at + width + 1] - self.pixels[at + width])
-        grey = top + fv * (low - top)
+        picture = self.pixels[first : first + width * height].view(1, 1, height, width)
+        grey = self.remap(picture, p[None], q[None], padding_mode="border", align_corners=True)[0, 0]
         mean = (weight * grey).sum(dim=1)
         contrast = ((weight * grey * grey).sum(dim=1) - mean * mean).clamp(min=0)
         noise = self.numbers[NOISE]
