@@ -25,7 +25,7 @@ ROOMS = (
     ("reconstruction",),
     ("capture",),
     ("measurement",),
-    ("decisions",),
+    ("rework", "decisions"),
     ("report", "history", "calibration", "acceptance", "evaluation"),
     ("workflow",),
     ("live",),

@@ -20,8 +20,54 @@ NamedPoint = Literal["mass", "seat", "axis", "hole"]
 its axis, centre of its hole."""
 
 DatumFeature = Literal["plane", "hole", "pin", "cylinder", "edge", "point", "fit"]
+ReworkVerb = Literal["towards", "away from"]
 DOF_NAMES = ("rx", "ry", "rz", "tx", "ty", "tz")
 """Degrees of freedom: rotations about and translations along the axes of the model."""
+
+
+@dataclass(frozen=True)
+class ReworkAxis:
+    """A direction on the part by whose name a fitter is told to move a component.
+
+    Attributes:
+        verb: towards, or away from, the target.
+        target: name of a component, or of a datum feature as in ``hole_B``; empty for a direction of its own.
+        direction_in_model: (3,) unit vector; None where there is a target.
+        name: text for the fitter; empty: verb and target.
+    """
+
+    verb: ReworkVerb = "towards"
+    target: str = ""
+    direction_in_model: Vector | None = None
+    name: str = ""
+
+
+@dataclass(frozen=True)
+class ReworkKind:
+    """How components of one kind are reworked.
+
+    Attributes:
+        name: unbolt, reweld, …, see `arview.cad.rework_table.KINDS`, or one of the part file.
+        text: of the part file, for the fitter.
+        steps: instead of the usual ones; ``{move}`` stands for the moves, ``{component}`` for the name.
+        pictures: paths relative to the part file.
+    """
+
+    name: str = "adjust"
+    text: str = ""
+    steps: tuple[str, ...] = ()
+    pictures: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class ReworkSettings(ReworkKind):
+    """How one component is reworked: its kind, with what the component has of its own.
+
+    Attributes:
+        axes: directions by which its moves are stated, before those that are found.
+    """
+
+    axes: tuple[ReworkAxis, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -35,6 +81,7 @@ class ComponentSettings:
         angle_tolerance_deg: largest allowed rotation from nominal; None: not judged.
         symmetry: rotation that cannot be observed, in the model frame.
         point: the point whose displacement is stated: a named one, or coordinates in the model, mm.
+        rework: how it is put right when it is out of tolerance.
     """
 
     name: str
@@ -43,6 +90,7 @@ class ComponentSettings:
     angle_tolerance_deg: float | None = None
     symmetry: Symmetry | None = None
     point: NamedPoint | Vector = "mass"
+    rework: ReworkSettings = ReworkSettings()
 
 
 @dataclass(frozen=True)
@@ -66,6 +114,11 @@ class Datum:
     direction_in_model: Vector
     diameter_mm: float | None = None
     locks: tuple[str, ...] = DOF_NAMES
+
+    @property
+    def feature_name(self) -> str:
+        """Name on the part, as in ``hole_B``."""
+        return f"{self.feature}_{self.label}"
 
 
 @dataclass(frozen=True)

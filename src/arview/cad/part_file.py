@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import tomllib
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any, cast
@@ -21,10 +21,12 @@ from arview.cad.part import (
     Guide,
     NamedPoint,
     Part,
+    ReworkKind,
     Role,
     Vector,
     unknown_component,
 )
+from arview.cad.rework_table import read_rework, read_rework_kinds
 from arview.cad.symmetry import Symmetry
 from arview.cad.toml_table import TomlTable
 from arview.cad.view_range import UP_AXES, Up, ViewRange
@@ -94,6 +96,21 @@ angle_tolerance_deg = 0.5      # largest allowed rotation from nominal
 # point = "seat"               # or [60.0, 40.0, 0.0]
 # A rotation that changes nothing about the component: it cannot be measured and is not judged.
 symmetry = { axis = [0.0, 0.0, 1.0], through_mm = [60.0, 40.0, 0.0], order = "continuous" }
+
+# How it is put right when it is out of tolerance; `arview rework` and the report tell which way and how far. All may be
+# left out, and stand in [defaults.rework] for all components.
+[components.post_1.rework]
+how = "unbolt"                 # adjust (default), unbolt, reweld, reglue, shim, bend, replace, or one of [rework.KIND]
+text = "2 × M6 from below, 9 N m"
+# pictures = ["post_bolts.jpg"]   # relative to this file
+# Directions that the fitter has, before those that are found (neighbours, datum features, up and down):
+axes = [{ toward = "hole_B" }, { away_from = "post_2" }, { direction = [0.0, 1.0, 0.0], name = "towards the hinge" }]
+
+# Text, pictures and steps of all components of a kind; a kind of your own needs steps. {move} stands for the moves,
+# {component} for the name.
+[rework.reweld]
+text = "MAG, seam 3 mm"
+# steps = ["Grind the seam of {component} open.", "{move}", "Tack, measure, weld."]
 
 # Rotations that change nothing about the whole part: order 2 is half a turn, 6 a hexagon's; or "continuous".
 # through_mm may be left out here: the middle of the bounding box.
@@ -185,7 +202,7 @@ def part_from_text(
 
 
 def _read_part(root: TomlTable, path: Path, unit: str | None, load: Callable[..., LoadedCad]) -> Part:
-    for key in ("part", "view_range", "guides", "defaults", "components", "symmetry", "datums"):
+    for key in ("part", "view_range", "guides", "defaults", "components", "symmetry", "datums", "rework"):
         root.known(key)
     root.finish()
     head = root.table("part", required=True)
@@ -207,7 +224,9 @@ def _read_part(root: TomlTable, path: Path, unit: str | None, load: Callable[...
     up = cast(Up, own_up or cad.up)
     view_range = replace(view_range, up=up) if view_range else None
     names = [component.name for component in cad.model.components]
-    defaults = _read_settings(root.table("defaults"), "", cad.model, ComponentSettings(""))
+    datums = _read_datums(root.table("datums"), cad.model)
+    rework = _ReworkTables(read_rework_kinds(root.table("rework")), [*names, *(d.feature_name for d in datums)])
+    defaults = _read_settings(root.table("defaults"), "", cad.model, ComponentSettings(""), rework)
     tables = root.table("components")
     selectors = _selectors(tables, names, cad.paths)
     settings, components = [], []
@@ -216,7 +235,7 @@ def _read_part(root: TomlTable, path: Path, unit: str | None, load: Callable[...
         for key in selectors[component.name]:
             table = tables.table(key)
             color = table.color("color") or color
-            setting = _read_settings(table, component.name, cad.model, setting)
+            setting = _read_settings(table, component.name, cad.model, setting, rework)
         settings.append(setting)
         if setting.role != "ignore":
             components.append(replace(component, color=color) if color else component)
@@ -227,7 +246,6 @@ def _read_part(root: TomlTable, path: Path, unit: str | None, load: Callable[...
     symmetries = tuple(
         _read_symmetry(table, tuple(model.center_in_model.tolist())) for table in root.tables("symmetry")
     )
-    datums = _read_datums(root.table("datums"), cad.model)
     return Part(
         name=name,
         path=path,
@@ -311,7 +329,17 @@ def _read_guides(tables: TomlTable) -> tuple[Guide, ...]:
     return tuple(guides)
 
 
-def _read_settings(table: TomlTable, name: str, model: Model, defaults: ComponentSettings) -> ComponentSettings:
+@dataclass(frozen=True)
+class _ReworkTables:
+    """Kinds of rework of a part file, and names by which directions can be given."""
+
+    kinds: dict[str, ReworkKind]
+    targets: list[str]
+
+
+def _read_settings(
+    table: TomlTable, name: str, model: Model, defaults: ComponentSettings, rework: _ReworkTables
+) -> ComponentSettings:
     """Settings of one component, or of [defaults] when ``name`` is empty."""
     symmetry = defaults.symmetry
     if name and "symmetry" in table.content:
@@ -326,6 +354,7 @@ def _read_settings(table: TomlTable, name: str, model: Model, defaults: Componen
         angle_tolerance_deg=table.positive("angle_tolerance_deg", defaults.angle_tolerance_deg),
         symmetry=symmetry,
         point=_read_point(table, defaults.point),
+        rework=read_rework(table.table("rework"), rework.kinds, rework.targets, defaults.rework),
     )
     table.finish()
     return settings

@@ -63,7 +63,7 @@ class TomlTable:
         value = self.content[key] if self.known(key) else []
         if not isinstance(value, list) or not all(isinstance(item, dict) for item in value):
             self.fail(key, value, f"tables [[{key}]]")
-        return [TomlTable(self.path, key, item) for item in value]
+        return [TomlTable(self.path, f"{self.name}.{key}".lstrip("."), item) for item in value]
 
     def text(self, key: str, default: str | None = None) -> str:
         """A string; required unless there is a default."""
@@ -73,6 +73,15 @@ class TomlTable:
         if not isinstance(value, str):
             self.fail(key, value, "text in quotes")
         return str(value)
+
+    def texts(self, key: str, default: tuple[str, ...] = ()) -> tuple[str, ...]:
+        """A list of strings that are not empty; the default when the key is absent."""
+        if not self.known(key):
+            return default
+        value = self.content[key]
+        if not isinstance(value, list) or not value or not all(isinstance(one, str) and one.strip() for one in value):
+            self.fail(key, value, "a list of texts in quotes")
+        return tuple(value)
 
     def choice(
         self, key: str, options: tuple[str, ...], default: str | None = None, required: bool = False

@@ -67,7 +67,7 @@ def measurand_of(name: str, part: Part, options: MeasurandOptions | None = None)
     o = options or MeasurandOptions()
     component = part.model.component(name)
     settings = part.component_settings(name)
-    seat = _seat(component, part.model, o)
+    seat = seat_of(component, part.model, o)
     symmetries = symmetries_of(component, part)
     axis, axis_from = _own_axis(component, symmetries, seat)
     kind, point = _point(name, part, component, symmetries, seat)
@@ -88,15 +88,16 @@ def on_axis(point: Array, symmetry: Symmetry) -> Array:
 
 
 @dataclass(frozen=True)
-class _Seat:
+class Seat:
     """Where a component stands: middle of the contact (3,), and its unit normal (3,) into the component, or None."""
 
     middle: Array
     normal: Array | None
 
 
-def _seat(component: Component, model: Model, o: MeasurandOptions) -> _Seat | None:
+def seat_of(component: Component, model: Model, options: MeasurandOptions | None = None) -> Seat | None:
     """The surface in contact with other components; None if it touches none."""
+    o = options or MeasurandOptions()
     corners = component.vertices_in_model[component.faces]
     areas = face_areas(component.vertices_in_model, component.faces.astype(np.int64))
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -118,10 +119,10 @@ def _seat(component: Component, model: Model, o: MeasurandOptions) -> _Seat | No
     mean = np.average(directions, axis=0, weights=weights)
     length = float(np.linalg.norm(mean))
     normal = -mean / length if length > o.min_coherence else None
-    return _Seat(np.average(middles, axis=0, weights=weights), normal)
+    return Seat(np.average(middles, axis=0, weights=weights), normal)
 
 
-def _own_axis(component: Component, symmetries: list[Symmetry], seat: _Seat | None) -> tuple[Array, str]:
+def _own_axis(component: Component, symmetries: list[Symmetry], seat: Seat | None) -> tuple[Array, str]:
     """(3,) own axis and what it is: of symmetry, the normal of the seat, that of the largest flat face, or +Z."""
     turning = [one for one in symmetries if one.order is None]
     main = turning if len(turning) == 1 else [one for one in symmetries if one.order is not None and one.order > 2]
@@ -150,7 +151,7 @@ def _max_area_normal(component: Component) -> Array | None:
 
 
 def _point(
-    name: str, part: Part, component: Component, symmetries: list[Symmetry], seat: _Seat | None
+    name: str, part: Part, component: Component, symmetries: list[Symmetry], seat: Seat | None
 ) -> tuple[str, Array]:
     """Kind and nominal position (3,) of the point that the part file names."""
     wanted = part.component_settings(name).point
