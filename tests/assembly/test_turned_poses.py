@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -9,8 +11,11 @@ from arview.assembly.direction_evidence import DirectionEvidence, DirectionOptio
 from arview.assembly.monitor import AssemblyMonitor
 from arview.assembly.monitor_state import MonitorState
 from arview.assembly.turned_poses import Turn, TurnedPoses, TurnEvidence, base_turns
-from arview.cad.model import Component
+from arview.cad.model import Component, make_model
+from arview.cad.view_range import ViewRange
 from arview.geometry import Array, apply, exp_so3, rigid
+from arview.guideviews import GuideViewOptions
+from arview.guideviews.cache import cached_guide_views
 from arview.pose import Presence
 from arview.tracking import TrackingSession
 from helpers.cad_files import box
@@ -19,6 +24,7 @@ from helpers.synthetic import CAMERA, assembly, assembly_views, changed, compone
 NAMES = tuple(one.name for one in assembly().components)
 PLATE = assembly().components[0]
 TURNS = base_turns(assembly().components, 0)
+FEW = ViewRange((380.0, 420.0), elevation_deg=(40.0, 50.0), azimuth_deg=(-10.0, 10.0), roll_deg=(-5.0, 5.0))
 NOTHING = np.zeros(len(NAMES), dtype=bool)
 SEEN = np.where(np.arange(len(NAMES)) > 0, 2.0, 0.0)
 
@@ -48,15 +54,19 @@ def test_the_symmetries_of_a_base_leave_it_where_it_is() -> None:
     assert turns_of(component("uneven", (uneven, stepped.faces), (0.5, 0.5, 0.5))) == []
 
 
+def twins() -> tuple[Component, ...]:
+    """A plate that looks the same after half a turn, by which two posts change places, and a block in one corner."""
+    boxes = {
+        "plate": ((0, 0, 0), (100, 60, 6)),
+        "left": ((10, 26, 6), (18, 34, 20)),
+        "right": ((82, 26, 6), (90, 34, 20)),
+        "corner": ((5, 5, 6), (15, 15, 9)),
+    }
+    return tuple(component(name, box(*corners), (0.5, 0.5, 0.5)) for name, corners in boxes.items())
+
+
 def test_components_of_one_shape_change_places() -> None:
-    names = ("plate", "left", "right", "corner")
-    boxes = (
-        ((0, 0, 0), (100, 60, 6)),
-        ((10, 26, 6), (18, 34, 20)),
-        ((82, 26, 6), (90, 34, 20)),
-        ((5, 5, 6), (15, 15, 9)),
-    )
-    parts = [component(name, box(*corners), (0.5, 0.5, 0.5)) for name, corners in zip(names, boxes, strict=True)]
+    parts = twins()
     upright = next(turn for turn in base_turns(parts, 0) if turn.model_from_model[2, 2] > 0.9)
     assert upright.counterparts.tolist() == [0, 2, 1, -1]
     turned = TurnedPoses(parts, 0)
@@ -90,6 +100,37 @@ def test_what_is_seen_decides_between_poses(
     assert bool(turned.open_turns(NOTHING)) == is_open
     turned.reset()
     assert len(turned.open_turns(NOTHING)) == 3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("left", "right", "said"),
+    [
+        (-5.0, -5.0, (Presence.PRESENT, Presence.PRESENT)),
+        # The right one stays verified by what was seen before, but hardly is: the left one may be what is seen there.
+        (-5.0, -0.2, (Presence.UNVERIFIED, Presence.PRESENT)),
+        (-5.0, 5.0, (Presence.UNCERTAIN, Presence.UNCERTAIN)),
+    ],
+)
+def test_one_of_two_that_may_have_changed_places_is_present_only_if_both_are(
+    left: float, right: float, said: tuple[Presence, Presence]
+) -> None:
+    model = make_model("twins", twins())
+    seen = AssemblyMonitor(cached_guide_views(model, FEW, GuideViewOptions(renderer="zbuffer")), CAMERA, model)
+    pose = pose_from(0, 45, 400, model)
+    log_odds = np.array([-6.0, left, right, 0.0])
+    seen._state = replace(
+        seen._state, log_odds=log_odds, is_verified=log_odds < 0.0, is_mismatched=log_odds > 4.0,
+        is_missing=log_odds > 4.0, observations=4,
+    )  # fmt: skip
+    found = seen.presence(pose)
+    assert (found["left"].presence, found["right"].presence) == said
+    # The block in the corner tells the two poses apart: once it is seen each is what it looks like.
+    log_odds = np.array([-6.0, left, right, -5.0])
+    seen._state = replace(seen._state, log_odds=log_odds, is_verified=log_odds < 0.0, observations=5)
+    found = seen.presence(pose)
+    assert found["left"].presence is Presence.PRESENT
+    assert found["right"].presence is (Presence.MISSING if right > 4.0 else Presence.PRESENT)
 
 
 @pytest.mark.slow

@@ -367,9 +367,11 @@ class AssemblyMonitor:
             Presence.UNVERIFIED,
         )
         is_open = np.full(len(found), is_ambiguous)
+        # One that stays verified although the evidence for it has become weak does not vouch for another.
+        firm = np.where(state.is_verified & (state.log_odds >= o.verified_log_odds), Presence.UNVERIFIED, found)
         for turn in self._turned.open_turns(state.is_verified):
             # In the turned pose each component is what was found at the place of its counterpart.
-            turned = np.where(turn.counterparts >= 0, found[turn.counterparts], Presence.UNVERIFIED)
+            turned = np.where(turn.counterparts >= 0, firm[turn.counterparts], Presence.UNVERIFIED)
             is_open |= (turned != found) & ((found == Presence.PRESENT) | state.is_missing)
         if not self.is_placed and self.is_bare:
             is_open |= state.is_missing
