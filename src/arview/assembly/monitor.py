@@ -9,13 +9,14 @@ all parts.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
 
 from arview.assembly.direction_evidence import DirectionEvidence, DirectionOptions
+from arview.assembly.loss_memory import LossMemory, LossMemoryOptions
 from arview.assembly.monitor_state import MonitorState
 from arview.assembly.observation import ComponentObserver, Known, Observation, ObservationOptions, base_of
 from arview.assembly.present_lines import PresentLines
@@ -53,7 +54,6 @@ class MonitorOptions:
             and from which on it is so blurred that edges that are not found say nothing.
         max_log_odds: bound on the summed log odds, in both directions.
         forgetting: share of the summed log odds that is lost with each observation.
-        carried_share: share of the summed log odds that counts after the part was lost and found again.
         first_observations: frames after a lock that are all observed. No component is called mismatched before the
             last of them, because noise differs between frames.
         incomplete_quality: poses of lower quality are observed at once while components are suspect.
@@ -68,6 +68,7 @@ class MonitorOptions:
         observation: options of a single observation.
         turned_poses: options of the comparison with poses in which the base looks the same.
         directions: options of combining observations from one direction.
+        loss_memory: options of what is kept while the part is lost.
     """
 
     mismatch_log_odds: float = 2.0
@@ -84,7 +85,6 @@ class MonitorOptions:
     motion_px: tuple[float, float] = (25.0, 45.0)
     max_log_odds: float = 6.0
     forgetting: float = 0.01
-    carried_share: float = 0.7
     first_observations: int = 2
     incomplete_quality: float = 0.85
     urgent_frames: int = 2
@@ -96,6 +96,7 @@ class MonitorOptions:
     observation: ObservationOptions = field(default_factory=ObservationOptions)
     turned_poses: TurnedPoseOptions = field(default_factory=TurnedPoseOptions)
     directions: DirectionOptions = field(default_factory=DirectionOptions)
+    loss_memory: LossMemoryOptions = field(default_factory=LossMemoryOptions)
 
 
 class AssemblyMonitor:
@@ -137,8 +138,7 @@ class AssemblyMonitor:
         self._corners = _box_corners(boxes).reshape(-1, 3)
         low, high = boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)
         self._part_corners = _box_corners(np.array([[low, high]])).reshape(-1, 3)
-        self._aside: MonitorState | None = None
-        self.reset()
+        self.forget()
 
     @property
     def mismatches(self) -> tuple[str, ...]:
@@ -169,7 +169,7 @@ class AssemblyMonitor:
     @property
     def may_be_bare(self) -> bool:
         """Whether most of the components may be absent: of those about which something is known no more are present."""
-        known = self._aside or self._state
+        known = self._memory.aside or self._state
         return int((known.is_mismatched & ~self._is_base).sum()) >= int((known.is_verified & ~self._is_base).sum())
 
     @property
@@ -178,11 +178,17 @@ class AssemblyMonitor:
         return self._turned.better
 
     def turn(self, turn: Turn) -> None:
-        """Take a turned pose: what was seen of a place is known of the component that belongs there now."""
-        before = self._state
+        """Take a turned pose: what was seen of a place is known of the component that belongs there now.
+
+        If the part was lost before, and this turn had been ruled out by then, what was known then holds again.
+        """
+        before, was_resumed = self._state, self._is_resumed
+        known = self._memory.before_turn(self._turned.index_of(turn)) if was_resumed else None
         self.reset()
-        if before.observations:
-            self._state = before.turned(turn, self.options.carried_share)
+        if known is not None:
+            self._state, self._is_resumed = known, True
+        elif before.observations:
+            self._state = before.turned(turn, self.options.loss_memory.carried_share)
 
     def other_poses(self, cam_from_model: Array) -> tuple[Array, ...]:
         """Poses (4,4) in which the base looks the same, and of which nothing has yet shown that they are wrong."""
@@ -191,40 +197,40 @@ class AssemblyMonitor:
         turns = self._turned.open_turns(self._state.is_verified)
         return tuple(cam_from_model @ turn.model_from_model for turn in turns)
 
-    def set_aside(self) -> None:
-        """Keep what is known while the part is lost, for `resume`."""
+    def set_aside(self, last_pose: Array | None = None) -> None:
+        """Keep what is known while the part is lost, for `resume`; the last pose (4,4) that was supported, if known."""
         if self._state.observations:
-            self._aside = self._state
+            ruled_out = self._turned.ruled_out(self._state.is_verified)
+            self._memory.set_aside(self._state, ruled_out, last_pose, self.is_placed)
 
-    def resume(self) -> None:
-        """Take up what was known before the part was lost: the same specimen was found again."""
-        o, before, now = self.options, self._aside, self._state
-        self._aside = None
+    def resume(self, cam_from_model: Array | None = None, frames_lost: int = 0) -> None:
+        """Take up what was known before the part was lost: the same specimen was found again.
+
+        Args:
+            cam_from_model: (4,4) where it was found; None: it is not known how it lies.
+            frames_lost: frames without a pose.
+        """
+        o, before, now = self.options, self._memory.aside, self._state
+        self._memory.aside = None
         if before is None or before is now:
             return
-        summed = np.clip(o.carried_share * before.log_odds + now.log_odds, -o.max_log_odds, o.max_log_odds)
-        is_wrong = summed > o.cleared_log_odds
-        self._state = replace(
-            now,
-            log_odds=summed,
-            directions=before.directions,
-            is_mismatched=(before.is_mismatched | now.is_mismatched) & is_wrong,
-            is_missing=(before.is_missing | now.is_missing) & is_wrong,
-            is_verified=(before.is_verified | now.is_verified) & ~is_wrong,
-            alternative=np.maximum(before.alternative, now.alternative),
-            shifts=np.where((now.alternative > before.alternative)[:, None], now.shifts, before.shifts),
-            observations=before.observations + now.observations,
-        )
+        share = o.loss_memory.carried_share
+        self._state = before.followed_by(now, share, o.max_log_odds, o.cleared_log_odds)
+        self._is_resumed = True
+        if cam_from_model is not None:
+            ruled_out, was_placed = self._memory.still_known(cam_from_model, frames_lost)
+            self._turned.exclude(ruled_out)
+            self.is_placed |= was_placed
 
     def forget(self) -> None:
         """Forget all observations, those set aside too."""
-        self._aside = None
+        self._memory = LossMemory(self.options.loss_memory)
         self.reset()
 
     def reset(self) -> None:
         """Forget the observations since the part was found: another part may be in view."""
         self._turned.reset()
-        self.is_placed = True
+        self.is_placed, self._is_resumed = True, False
         count = len(self._views.component_names)
         self._said: tuple[tuple[int, bool, bool, bytes], Mapping[str, ComponentPresence]] | None = None
         self._state = MonitorState(
@@ -306,14 +312,19 @@ class AssemblyMonitor:
         turns = [np.eye(4), *(turn.model_from_model for turn in self._turned.turns)]
         return any(are_near(a @ turn, b, same_mm, same_deg) for turn in turns)
 
-    def best_turned(self, image: NDArray[np.uint8], cam_from_model: Array) -> Array:
+    def best_turned(self, image: NDArray[np.uint8], cam_from_model: Array, frames_lost: int | None = None) -> Array:
         """Of a pose (4,4) and those in which the base looks the same, the one of which a picture shows most.
 
         Args:
             image: (H,W,3) uint8 RGB of the camera's size.
             cam_from_model: (4,4) mm.
+            frames_lost: frames since the part was lost: if they are few it still lies as it did; None: it was not.
         """
-        return self._turned.best(cam_from_model, lambda pose: self._observer.pose_evidence(image, pose))
+        return self._turned.best(
+            cam_from_model,
+            lambda pose: self._observer.pose_evidence(image, pose),
+            lambda pose: frames_lost is not None and self._memory.is_as_before(pose, frames_lost),
+        )
 
     def presence(self, cam_from_model: Array, is_ambiguous: bool = False) -> Mapping[str, ComponentPresence]:
         """Presence of each component by its name; empty for a part of one component.
@@ -432,7 +443,7 @@ class AssemblyMonitor:
         """
         state = self._state
         is_open = state.log_odds > self.options.open_log_odds
-        is_new = state.observations < self.options.first_observations and self._aside is None
+        is_new = state.observations < self.options.first_observations and self._memory.aside is None
         if is_new or not is_open.any():
             return is_open
         open_indices = np.flatnonzero(is_open)

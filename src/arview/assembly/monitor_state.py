@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,4 +70,30 @@ class MonitorState:
             alternative=np.zeros(len(source)),
             shifts=np.zeros((len(source), 3)),
             observations=self.observations,
+        )
+
+    def followed_by(
+        self, later: MonitorState, share: float, max_log_odds: float, cleared_log_odds: float
+    ) -> MonitorState:
+        """Evidence of this state and a later one of the same specimen say together.
+
+        Args:
+            later: since the part was found again.
+            share: of the log odds of this state, that counts.
+            max_log_odds: bound on the summed log odds.
+            cleared_log_odds: a component with more is not verified, one with less not mismatched.
+        """
+        summed = np.clip(share * self.log_odds + later.log_odds, -max_log_odds, max_log_odds)
+        is_wrong = summed > cleared_log_odds
+        is_later = later.alternative > self.alternative
+        return replace(
+            later,
+            log_odds=summed,
+            directions=self.directions,
+            is_mismatched=(self.is_mismatched | later.is_mismatched) & is_wrong,
+            is_missing=(self.is_missing | later.is_missing) & is_wrong,
+            is_verified=(self.is_verified | later.is_verified) & ~is_wrong,
+            alternative=np.maximum(self.alternative, later.alternative),
+            shifts=np.where(is_later[:, None], later.shifts, self.shifts),
+            observations=self.observations + later.observations,
         )

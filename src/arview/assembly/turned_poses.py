@@ -34,6 +34,7 @@ class TurnedPoseOptions:
             symmetry is exact.
         base_weight: log odds per share of the base's edge points that are found.
         max_added: bound on what one observation adds.
+        as_before: log odds for the pose in which the part lies as it did before it was lost for a moment.
         better: summed log odds from which on a turned pose is better.
         worse: summed log odds below which it is none.
     """
@@ -44,6 +45,7 @@ class TurnedPoseOptions:
     exact_share: float = 0.003
     base_weight: float = 30.0
     max_added: float = 4.0
+    as_before: float = 6.0
     better: float = 5.5
     worse: float = -3.5
 
@@ -135,6 +137,19 @@ class TurnedPoses:
             if k not in self._excluded and not np.any(is_seen & turn.unmatched()[0])
         ]
 
+    def index_of(self, turn: Turn) -> int:
+        """Index of one of the turns; -1 for another."""
+        return next((k for k, one in enumerate(self.turns) if one is turn), -1)
+
+    def ruled_out(self, is_present: NDArray[np.bool_]) -> frozenset[int]:
+        """Indices of the turns that are not open, see `open_turns`."""
+        is_open = {self.index_of(turn) for turn in self.open_turns(is_present)}
+        return frozenset(range(len(self.turns))) - is_open
+
+    def exclude(self, turns: frozenset[int]) -> None:
+        """Exclude turns by their indices: it is known that the part is not turned so."""
+        self._excluded |= turns
+
     def reset(self) -> None:
         """Forget all comparisons."""
         self._excluded, self._sums = set(), []
@@ -159,15 +174,27 @@ class TurnedPoses:
             if self._sums[k] <= o.worse:
                 self._excluded.add(k)
 
-    def best(self, cam_from_model: Array, evidence_at: Callable[[Array], TurnEvidence]) -> Array:
-        """The best (4,4) of a pose and those turned from it, by one picture; see `compare` for the arguments."""
+    def best(
+        self,
+        cam_from_model: Array,
+        evidence_at: Callable[[Array], TurnEvidence],
+        is_as_before: Callable[[Array], bool] = lambda pose: False,
+    ) -> Array:
+        """The best (4,4) of a pose and those turned from it, by one picture.
+
+        Args:
+            cam_from_model: (4,4).
+            evidence_at: see `compare`.
+            is_as_before: whether the part lies as it did before it was lost for a moment.
+        """
         if not self.turns:
             return cam_from_model
         here = evidence_at(cam_from_model)
         poses = [cam_from_model @ turn.model_from_model for turn in self.turns]
         gains = [self._gain(turn, here, evidence_at(pose)) for turn, pose in zip(self.turns, poses, strict=True)]
-        best = int(np.argmax(gains))
-        return poses[best] if gains[best] > 0.0 else cam_from_model
+        known = self._options.as_before * np.array([is_as_before(pose) for pose in (cam_from_model, *poses)])
+        totals = np.array([0.0, *gains]) + known
+        return (cam_from_model, *poses)[int(np.argmax(totals))]
 
     def _gain(self, turn: Turn, here: TurnEvidence, there: TurnEvidence) -> float:
         """Log odds of a turned pose to the tracked one by what is seen in both."""

@@ -208,7 +208,7 @@ class TrackingSession:
             and self._state.is_confirmed
             and known.identity in (Identity.FOLLOWED, Identity.CONFIRMED)
         ):
-            self.components.resume()
+            self.components.resume(estimate.cam_from_model, self._state.frames_without_pose)
         ms = (time.perf_counter() - started) * 1e3
         if estimate is None:
             guide = self._guide if self.is_aligning else None
@@ -262,8 +262,11 @@ class TrackingSession:
         if self._guide is not None and not self._state.is_confirmed:
             self._state.retract()
         else:
+            recent = self._state.recent_poses
             self._state.lose(reason)
-            self.components.set_aside()
+            # Poses shortly before a loss may be wrong; the identity rests on the last one without doubt.
+            last = self.identity.last_pose
+            self.components.set_aside(recent[-1] if last is None and recent else last)
         return None, self._state.reason
 
     def _is_possible(self, estimate: Estimate) -> bool:
@@ -289,16 +292,19 @@ class TrackingSession:
         detections = self._detect_remembered(searched) if is_resting else self._detect(searched, searches)
         detections = [one for one in detections if not self._is_other(one.cam_from_model)]
         reason = ""
+        is_bare = o.use_base_detection and self.components.may_be_bare
         if detections:
-            estimate, reason = self._begin_detected(image, detections[0], o.lock_quality)
+            found = detections[0]
+            if is_bare and s.state == TrackingState.LOST:
+                found = self._as_before(image, found)
+            estimate, reason = self._begin_detected(image, found, o.lock_quality)
             if estimate is not None or is_resting:
                 return estimate, reason
         if not is_resting:
-            is_bare = o.use_base_detection and self.components.may_be_bare
-            found = self._detect_base(searched, searches) if is_bare else None
-            if found is not None:
-                self._expect_base(found.cam_from_model)
-                estimate, base_reason = self._begin_detected(image, found, math.inf)
+            bare = self._detect_base(searched, searches) if is_bare else None
+            if bare is not None:
+                self._expect_base(bare.cam_from_model)
+                estimate, base_reason = self._begin_detected(image, bare, math.inf)
                 if estimate is not None:
                     self.components.is_placed = False
                     return estimate, base_reason
@@ -320,11 +326,16 @@ class TrackingSession:
         found = [one for one in self._base.detect(image, searches) if not self._is_other(one.cam_from_model)]
         if not found:
             return None
-        pose = self.components.best_turned(image, found[0].cam_from_model)
+        return self._as_before(image, found[0])
+
+    def _as_before(self, image: NDArray[np.uint8], found: Detection) -> Detection:
+        """A detection, turned as the picture shows the components, and as the part lay before a short loss."""
+        frames_lost = None if self.has_pose else self._state.frames_without_pose
+        pose = self.components.best_turned(image, found.cam_from_model, frames_lost)
         o = self._base.options
         apart_mm = o.alternative_share * self.views.diameter_mm
-        others = [other for other in found[0].alternatives if not are_near(other, pose, apart_mm, o.alternative_deg)]
-        return replace(found[0], cam_from_model=pose, alternatives=tuple(others))
+        others = [other for other in found.alternatives if not are_near(other, pose, apart_mm, o.alternative_deg)]
+        return replace(found, cam_from_model=pose, alternatives=tuple(others))
 
     def _expect_base(self, cam_from_model: Array) -> None:
         """Let the tracker expect no component but the base until they are seen."""

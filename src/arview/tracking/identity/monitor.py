@@ -24,6 +24,7 @@ from arview.pose import Identity, Pose
 from arview.tracking.estimate import Estimate
 from arview.tracking.identity.background_motion import BackgroundMotion, reduced
 from arview.tracking.identity.options import IdentityOptions
+from arview.tracking.identity.own_motion import OwnMotion
 from arview.tracking.identity.part_outline import PartOutline, PartPlace, transfer
 from arview.tracking.identity.specimen_search import Finders, SpecimenSearch
 
@@ -114,10 +115,16 @@ class IdentityMonitor:
         self.outline = PartOutline(views, camera)
         self._search = SpecimenSearch(self.outline, o)
         self._motion = BackgroundMotion(self.outline, o.background)
+        self._own_motion = OwnMotion(self.outline, o.own_motion)
         self._serials = serials
         self._reader = None if serials is None else SerialCodeReader(serials, o.code)
         self._named_at: tuple[int, Array] | None = None
         self.reset()
+
+    @property
+    def last_pose(self) -> Array | None:
+        """The last pose (4,4) of the followed specimen without doubt; None without one."""
+        return None if self._kept is None else self._kept.cam_from_model
 
     def reset(self) -> None:
         """Forget the followed specimen; the next one that is tracked is it."""
@@ -129,6 +136,7 @@ class IdentityMonitor:
         self._is_followed = False
         self._others_before: list[Array] | None = None
         self._doubt: Doubt | None = None
+        self._own_motion.reset()
         self._last_place: PartPlace | None = None
         self._frames_unsure = 0
         self._frame = 0
@@ -247,7 +255,7 @@ class IdentityMonitor:
             near = self._last_place or self.outline.place(self._kept.cam_from_model)
             if not self._is_shifted(near, self._place):
                 return Placement.SAME
-        return placement
+        return Placement.SAME if self._own_motion.leads_to(self._frame, pose) else placement
 
     def _follow(
         self,
@@ -264,6 +272,7 @@ class IdentityMonitor:
             return
         self._frames_unsure = 0 if is_sure else self._frames_unsure + 1
         if is_sure:
+            self._own_motion.add(self._frame, estimate.cam_from_model)
             self._keep(image, estimate.cam_from_model, estimate.quality, others)
 
     def _keep(self, image: NDArray[np.uint8], pose: Array, quality: float, others: tuple[Array, ...]) -> None:
@@ -340,7 +349,8 @@ class IdentityMonitor:
         """One step to settle a doubt; a pose (4,4) where the followed specimen is seen instead, or None."""
         o = self.options
         placement = self._compared(pose, self._motion.homography)
-        if placement is Placement.SAME and is_sure:
+        is_on_way = not doubt.reason and self._own_motion.leads_to(self._frame, pose)
+        if is_sure and (placement is Placement.SAME or is_on_way):
             self._settle(self._known)
             return None
         if not is_sure or self._kept is None:

@@ -43,6 +43,29 @@ class BackgroundMotionOptions:
 
 
 @dataclass(frozen=True)
+class OwnMotionOptions:
+    """When a part has gone on its own way while it was not seen.
+
+    Attributes:
+        frames: frames before the gap over which the motion is taken.
+        doubtful: the last of them whose poses may have been wrong.
+        max_gap: frames without a sure pose up to which it is continued.
+        near: shift in diameters from the expected place, across the line of sight, up to which the part is there.
+        near_depth: the same along the line of sight.
+        reach: shift in diameters from the last place beyond which another specimen may stand.
+        max_turn_deg: rotation since the last pose up to which it is the same part.
+    """
+
+    frames: int = 7
+    doubtful: int = 2
+    max_gap: int = 15
+    near: float = 0.2
+    near_depth: float = 0.6
+    reach: float = 0.6
+    max_turn_deg: float = 45.0
+
+
+@dataclass(frozen=True)
 class IdentityOptions:
     """Options of the monitoring of the identity.
 
@@ -72,6 +95,7 @@ class IdentityOptions:
         return_every_s: time between two checks whether the followed part is seen at its old place again.
         return_s: time after the doubt arose for which the old place is followed.
         background: of the motion of the background.
+        own_motion: of the part's own motion.
         code: of the reading of serial codes.
     """
 
@@ -97,4 +121,5 @@ class IdentityOptions:
     return_every_s: float = 0.35
     return_s: float = 10.0
     background: BackgroundMotionOptions = field(default_factory=BackgroundMotionOptions)
+    own_motion: OwnMotionOptions = field(default_factory=OwnMotionOptions)
     code: SerialCodeOptions = field(default_factory=SerialCodeOptions)

@@ -1,0 +1,98 @@
+"""What was known of the components when the part was lost, for when it is found again.
+
+Where most components are absent the part may be found again turned by a symmetry of its base, and what is said then is
+open. If the turns had been ruled out before, and the part lies as it did, they stay ruled out; if it turns out to have
+been found turned, what was known before the loss holds again.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from arview.assembly.monitor_state import MonitorState
+from arview.geometry import Array, rotation_angle_rad
+
+
+@dataclass(frozen=True)
+class LossMemoryOptions:
+    """When a part that is found again lies as it did, and what counts of the evidence before.
+
+    Attributes:
+        carried_share: share of the summed log odds that counts after the part was lost and found again.
+        brief_frames: frames without a pose up to which a part cannot have been turned by a quarter.
+        same_turn_deg: rotation from the last pose up to which the part then lies as it did.
+    """
+
+    carried_share: float = 0.7
+    brief_frames: int = 15
+    same_turn_deg: float = 45.0
+
+
+class KnownBefore(NamedTuple):
+    """What was known at a loss.
+
+    Attributes:
+        state: of the components.
+        ruled_out: indices of the turns that had been ruled out.
+    """
+
+    state: MonitorState
+    ruled_out: frozenset[int]
+
+
+class LossMemory:
+    """Keeps what is known of the components while the part is lost.
+
+    Attributes:
+        aside: the state at the last loss, until it is taken up.
+    """
+
+    def __init__(self, options: LossMemoryOptions) -> None:
+        self._options = options
+        self.aside: MonitorState | None = None
+        self._last_pose: Array | None = None
+        self._ruled_out: frozenset[int] = frozenset()
+        self._was_placed = False
+        self._surest: KnownBefore | None = None
+
+    def set_aside(
+        self, state: MonitorState, ruled_out: frozenset[int], last_pose: Array | None, was_placed: bool
+    ) -> None:
+        """Keep a state.
+
+        Args:
+            state: of the components.
+            ruled_out: indices of the turns that nothing leaves open.
+            last_pose: (4,4) the last that the picture supported; None: not known.
+            was_placed: whether the pose was known to be that of the part.
+        """
+        self.aside, self._ruled_out, self._last_pose, self._was_placed = state, ruled_out, last_pose, was_placed
+        if self._surest is None or ruled_out >= self._surest.ruled_out:
+            self._surest = KnownBefore(state, ruled_out)
+
+    def is_as_before(self, cam_from_model: Array, frames_lost: int) -> bool:
+        """Whether a part found at a pose (4,4) after some frames without one is turned as it was."""
+        o, last = self._options, self._last_pose
+        if last is None or frames_lost > o.brief_frames:
+            return False
+        return float(np.rad2deg(rotation_angle_rad(cam_from_model, last))) < o.same_turn_deg
+
+    def still_known(self, cam_from_model: Array, frames_lost: int) -> tuple[frozenset[int], bool]:
+        """What still holds of a part found at a pose (4,4), see `is_as_before`.
+
+        Returns:
+            indices of the turns that stay ruled out, and whether the pose is known to be that of the part.
+        """
+        if not self.is_as_before(cam_from_model, frames_lost):
+            return frozenset(), False
+        return self._ruled_out, self._was_placed
+
+    def before_turn(self, turn: int) -> MonitorState | None:
+        """The state before the loss, after which the part was found turned; None if it may have been so before."""
+        if self._surest is None or turn not in self._surest.ruled_out:
+            return None
+        known = self._surest.state
+        return replace(known, log_odds=self._options.carried_share * known.log_odds, last_pose=None, frames_since=0)
