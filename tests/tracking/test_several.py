@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import cv2
@@ -99,6 +100,30 @@ def test_a_hidden_specimen_is_not_in_the_picture_any_longer() -> None:
     right = np.s_[:, image.shape[1] // 2 + 60 :]
     np.testing.assert_array_equal(hidden[right], image[right])
     assert hide_specimens(image, (), views(), camera) is image
+
+
+@pytest.mark.slow
+def test_another_part_that_is_tracked_is_hidden_from_the_first_round_of_searches_only() -> None:
+    """Guide views made anew stand for another part: it looks the same, and is found only where the first is not."""
+    part, camera = load_part(str(PART)), two_specimens.wide_camera()
+    own = views()
+    others = replace(own)
+    first, second = TrackingSession(own, camera, part.model), TrackingSession(others, camera, part.model)
+    several = SeveralSessions({"one": first, "two": second})
+    frames = two_specimens.frames()
+    for index, (image, _) in enumerate(frames[:4]):
+        poses = several.process(image, index, index / 10.0)
+    found = sides(poses, frames[3][1])
+    assert sorted(side for side in found if side is not None) == [0, 1]
+    assert len(second.covers) == 1 and second.others == ()
+    # A part may stand on another: in the next round nothing is hidden.
+    second._state.frames_without_pose = 1
+    assert second._uncovered(image) is not image
+    second._state.frames_without_pose = 2 * second.options.search_every
+    assert second._uncovered(image) is image
+    # Nor is a place hidden at which the other part is not sure.
+    several._poses["one"] = replace(several._poses["one"], state=TrackingState.CRITICAL)
+    assert several._covers("two") == ()
 
 
 def test_specimens_are_told_apart_by_their_place() -> None:

@@ -172,7 +172,13 @@ class EdgeSupportMeter:
         self._pictures = EdgePictures()
 
     def measure(
-        self, image: NDArray[np.uint8], edges: VisibleEdges, cam_from_body: Array, intrinsics: Array, px_per_mm: float
+        self,
+        image: NDArray[np.uint8],
+        edges: VisibleEdges,
+        cam_from_body: Array,
+        intrinsics: Array,
+        px_per_mm: float,
+        is_absent: NDArray[np.bool_] | None = None,
     ) -> MeasuredSupport:
         """Edge support of all components.
 
@@ -182,13 +188,16 @@ class EdgeSupportMeter:
             cam_from_body: (4,4) pose about the model's centre.
             intrinsics: (10,) of the picture, see `intrinsics_of`.
             px_per_mm: scale at the part's centre.
+            is_absent: (C,) components whose edges are not those of any edge in the picture; None: there are none.
         """
+        none = np.zeros(len(edges.starts) - 1, dtype=bool)
         picture = self._pictures.of(image)
         projection = Projection(cam_from_body, intrinsics, 0.01 * self._diameter_mm)
         self._measured = picture, projection
         all_points, unshared = measure_edge_support(
-            picture, edges, projection, self._shifts(px_per_mm), self.options.points
-        )
+            picture, edges, none if is_absent is None else is_absent, projection, self._shifts(px_per_mm),
+            self.options.points,
+        )  # fmt: skip
         return MeasuredSupport(EdgeSupport(*all_points), EdgeSupport(*unshared))
 
     def found_points(self, edges: VisibleEdges, is_wanted: NDArray[np.bool_]) -> FoundPoints:
@@ -395,13 +404,15 @@ def _place_points(
 
 @kernel
 def measure_edge_support(
-    picture: EdgePicture, edges: VisibleEdges, projection: Projection, shifts: Shifts, limits: PointLimits
+    picture: EdgePicture, edges: VisibleEdges, is_absent: NDArray[np.bool_], projection: Projection, shifts: Shifts,
+    limits: PointLimits
 ) -> MeasuredSupport:  # fmt: skip
     """`MeasuredSupport` of all components.
 
     Args:
         picture: an `EdgePicture`; its working memory is overwritten.
         edges: `VisibleEdges` from about the direction of the picture.
+        is_absent: (C,) components that are not there: edges in the picture may be those of the others beside them.
         projection: `Projection` of the picture.
         shifts: `Shifts` to try.
         limits: see `PointLimits`.
@@ -416,8 +427,6 @@ def measure_edge_support(
     )  # fmt: skip
     pixels = projected.pixels
     find_thin_edges(picture, limits.min_slope)
-    mark_owners(pixels, projected.depths, edges.component, picture.owners)
-    is_unshared = _unshared_points(edges, projected, picture.owners)
     found = np.full((8, count), -1.0)
     support = EdgeSupport(found[0], found[1], found[2], found[3])
     unshared = EdgeSupport(found[4], found[5], found[6], found[7])
@@ -426,29 +435,41 @@ def measure_edge_support(
     along = np.empty((limits.max_points, 2), dtype=np.int64)
     scores = np.arange(256) / (np.arange(256) + HALF_SCORE_STRENGTH)
     no_costs = np.zeros(shifts.far.shape[0])
-    for c in range(count):
-        inside, determined = _usable_points(edges, edges.is_own, projected, c, shape, usable)
-        if inside < limits.min_points:
-            continue
-        kept = _place_points(projected, usable[:inside], places, along)
-        here = _best_shift(picture, c, places, along, kept, scores, shifts.near, shifts.near_costs, SHARED)
-        support.supported[c] = here
-        support.displaced[c] = limits.typical_displaced
-        if here < limits.well_supported:
-            support.displaced[c] = _best_shift(picture, c, places, along, kept, scores, shifts.far, no_costs, SHARED)
-        support.contrast[c] = _contrast(picture.image, edges, edges.is_own, projected, c, limits.color_reach_px)
-        support.determined[c] = determined
-        left, determined = _usable_points(edges, is_unshared, projected, c, shape, usable)
-        if left == inside:
-            found[4:, c] = found[:4, c]
-            continue
-        if left < limits.min_points:
-            continue
-        kept = _place_points(projected, usable[:left], places, along)
-        unshared.supported[c] = _best_shift(
-            picture, c, places, along, kept, scores, shifts.near, shifts.near_costs, NOBODYS
-        )
-        unshared.displaced[c] = support.displaced[c]
-        unshared.contrast[c] = _contrast(picture.image, edges, is_unshared, projected, c, limits.color_reach_px)
-        unshared.determined[c] = determined
+    # First those that may be there, among these alone; then the others, among all.
+    for is_second in (False, True):
+        if is_second and not is_absent.any():
+            break
+        is_left_out = is_absent & (not is_second)
+        mark_owners(pixels, projected.depths, edges.component, is_left_out, picture.owners)
+        is_unshared = _unshared_points(edges, projected, picture.owners)
+        for c in range(count):
+            if is_absent[c] != is_second:
+                continue
+            inside, determined = _usable_points(edges, edges.is_own, projected, c, shape, usable)
+            if inside < limits.min_points:
+                continue
+            kept = _place_points(projected, usable[:inside], places, along)
+            here = _best_shift(picture, c, places, along, kept, scores, shifts.near, shifts.near_costs, SHARED)
+            support.supported[c] = here
+            support.displaced[c] = limits.typical_displaced
+            if here < limits.well_supported:
+                support.displaced[c] = _best_shift(
+                    picture, c, places, along, kept, scores, shifts.far, no_costs, SHARED
+                )
+            reach_px = limits.color_reach_px
+            support.contrast[c] = _contrast(picture.image, edges, edges.is_own, projected, c, reach_px)
+            support.determined[c] = determined
+            left, determined = _usable_points(edges, is_unshared, projected, c, shape, usable)
+            if left == inside:
+                found[4:, c] = found[:4, c]
+                continue
+            if left < limits.min_points:
+                continue
+            kept = _place_points(projected, usable[:left], places, along)
+            unshared.supported[c] = _best_shift(
+                picture, c, places, along, kept, scores, shifts.near, shifts.near_costs, NOBODYS
+            )
+            unshared.displaced[c] = support.displaced[c]
+            unshared.contrast[c] = _contrast(picture.image, edges, is_unshared, projected, c, reach_px)
+            unshared.determined[c] = determined
     return MeasuredSupport(support, unshared)

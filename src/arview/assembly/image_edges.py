@@ -123,13 +123,17 @@ def find_thin_edges(picture: EdgePicture, min_slope: float) -> None:
 
 @kernel
 def mark_owners(
-    pixels: NDArray[np.float64], depths: NDArray[np.float64], component: NDArray[np.int16], owners: NDArray[np.int16]
+    pixels: NDArray[np.float64], depths: NDArray[np.float64], component: NDArray[np.int16],
+    is_left_out: NDArray[np.bool_], owners: NDArray[np.int16]
 ) -> None:  # fmt: skip
-    """Set ``owners`` (H,W) int16 to the component whose edges pass within two pixels, or `NOBODYS` or `SHARED`."""
+    """Set ``owners`` (H,W) int16 to the component whose edges pass within two pixels, or `NOBODYS` or `SHARED`.
+
+    Edges of components that are left out (C,) are nobody's.
+    """
     height, width = owners.shape
     owners[:] = NOBODYS
     for i in range(pixels.shape[0]):
-        if depths[i] <= 0:
+        if depths[i] <= 0 or is_left_out[component[i]]:
             continue
         x0, y0 = int(np.round(pixels[i, 0])), int(np.round(pixels[i, 1]))
         for y in range(max(0, y0 - MARKED_PX), min(height, y0 + MARKED_PX + 1)):

@@ -393,7 +393,7 @@ class AssemblyMonitor:
 
     def _visibilities(self, cam_from_model: Array) -> NDArray[np.int8]:
         """(C,) visibility of each component in a frame, as indices of `VISIBILITIES`."""
-        is_hidden = ~self._observer.visible_from(cam_from_model) | self._state.was_occluded
+        is_hidden = ~self._observer.visible_from(cam_from_model, self._state.is_mismatched) | self._state.was_occluded
         found = is_hidden.astype(np.int8)
         # Mostly the whole part is inside the picture.
         if not self._is_inside(self._part_corners, cam_from_model).all():
@@ -472,7 +472,7 @@ class AssemblyMonitor:
     def _shows_new(self, cam_from_model: Array) -> bool:
         """Whether this direction shows an open component that the last observation could not show."""
         state = self._state
-        is_visible = self._observer.visible_from(cam_from_model)
+        is_visible = self._observer.visible_from(cam_from_model, self._state.is_mismatched)
         return bool(np.any((state.log_odds > self.options.open_log_odds) & ~state.was_visible & is_visible))
 
     def _names(self, is_meant: NDArray[np.bool_]) -> tuple[str, ...]:

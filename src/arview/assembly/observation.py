@@ -195,8 +195,10 @@ class ComponentObserver:
         """All measurements but the search for alternative placements, and the picture around the part for that."""
         o = self._options
         crop = self._part_crop(image, cam_from_model)
-        edges = self._visible_edges.nearest(cam_from_model)
-        measured = self._meter.measure(crop.image, edges, crop.cam_from_body, crop.intrinsics, crop.px_per_mm)
+        edges = self._visible_edges.nearest(cam_from_model, known.is_absent)
+        measured = self._meter.measure(
+            crop.image, edges, crop.cam_from_body, crop.intrinsics, crop.px_per_mm, known.is_absent
+        )
         is_visible = measured.support.supported >= 0.0
         by_edges = edge_log_odds(measured, o.log_odds)
         is_doubtful = is_visible & (by_edges > o.confirmed_log_odds)
@@ -236,9 +238,14 @@ class ComponentObserver:
         moved_mm = apply(cam_from_model, self._corners_in_model) - apply(before, self._corners_in_model)
         return float(np.max(np.linalg.norm(moved_mm[:, :2], axis=1))) * px_per_mm / shrink
 
-    def visible_from(self, cam_from_model: Array) -> NDArray[np.bool_]:
-        """(C,) components that show enough edge points of their own from about the direction of a pose."""
-        edges = self._visible_edges.nearest(cam_from_model)
+    def visible_from(self, cam_from_model: Array, is_absent: NDArray[np.bool_] | None = None) -> NDArray[np.bool_]:
+        """(C,) components that show enough edge points of their own from about the direction of a pose.
+
+        Args:
+            cam_from_model: (4,4).
+            is_absent: (C,) components that hide nothing, because they are not there; None: all are there.
+        """
+        edges = self._visible_edges.nearest(cam_from_model, is_absent)
         if self._shown is None or self._shown[0] is not edges:
             points = np.bincount(edges.component[edges.is_own], minlength=len(edges.starts) - 1)
             self._shown = edges, np.asarray(points >= self._options.edge_support.points.min_points)

@@ -30,6 +30,7 @@ class TurnedPoseOptions:
         max_samples: samples of the surface of the base.
         same_share: distance in diameters of the base up to which a turned sample lies on its surface.
         min_same: share of the samples that must.
+        rough_step, rough_margin: every so many-th sample is tried first, and by how much fewer of these may lie there.
         exact_share: distance in diameters of the base up to which all its corners, turned, lie on corners if the
             symmetry is exact.
         base_weight: log odds per share of the base's edge points that are found.
@@ -42,6 +43,8 @@ class TurnedPoseOptions:
     max_samples: int = 3000
     same_share: float = 0.015
     min_same: float = 0.9
+    rough_step: int = 12
+    rough_margin: float = 0.15
     exact_share: float = 0.003
     base_weight: float = 30.0
     max_added: float = 4.0
@@ -213,7 +216,7 @@ def base_turns(components: Sequence[Component], base: int, options: TurnedPoseOp
     tree, corners = cKDTree(points), cKDTree(carrier.vertices_in_model)
     near_mm = max(o.same_share * diameter_mm, 2.0 * float(np.median(tree.query(points, k=2)[0][:, 1])))
     principal = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
-    surfaces: list[Array] = []
+    surfaces = _Surfaces(components, 0.5 * near_mm, o.max_samples)
     found: list[Turn] = []
     for axis in (*np.eye(3), *principal):
         for quarter in (2, 1, 3):
@@ -221,23 +224,43 @@ def base_turns(components: Sequence[Component], base: int, options: TurnedPoseOp
             if any(np.trace(rotation.T @ other.model_from_model[:3, :3]) > 2.9 for other in found):
                 continue
             turned = rigid(rotation, center - rotation @ center)
-            if np.mean(tree.query(apply(turned, points))[0] < near_mm) < o.min_same:
+            # Some of the samples show soon that most turns are none.
+            if _same_share(tree, apply(turned, points[:: o.rough_step]), near_mm) < o.min_same - o.rough_margin:
                 continue
-            surfaces = surfaces or [sample_surface(one, 0.5 * near_mm, o.max_samples).points for one in components]
+            if _same_share(tree, apply(turned, points), near_mm) < o.min_same:
+                continue
             off_mm = float(corners.query(apply(turned, carrier.vertices_in_model))[0].max())
-            counterparts = _counterparts(surfaces, turned, near_mm, o.min_same)
+            counterparts = surfaces.counterparts(turned, near_mm, o.min_same)
             found.append(Turn(turned, counterparts, off_mm < o.exact_share * diameter_mm))
     return found
 
 
-def _counterparts(surfaces: Sequence[Array], turned: Array, near_mm: float, min_same: float) -> NDArray[np.int64]:
-    """(C,) index of the surface on which each one lies after a turn (4,4), or -1, by samples (N,3) of each."""
-    found = np.full(len(surfaces), -1)
-    trees = [cKDTree(points) for points in surfaces]
-    for c, points in enumerate(surfaces):
-        moved = apply(turned, points)
-        for d, other in enumerate(surfaces):
-            apart = (moved.min(axis=0) - other.min(axis=0), moved.max(axis=0) - other.max(axis=0))
-            if np.abs(apart).max() < near_mm and np.mean(trees[d].query(moved)[0] < near_mm) >= min_same:
-                found[c] = d
-    return found
+def _same_share(tree: cKDTree, points: Array, near_mm: float) -> float:
+    """Share of points (N,3) that are near those of a tree."""
+    return float(np.mean(tree.query(points)[0] < near_mm))
+
+
+class _Surfaces:
+    """Samples of the surfaces of components, taken when first needed, at most ``max_samples`` of each."""
+
+    def __init__(self, components: Sequence[Component], spacing_mm: float, max_samples: int) -> None:
+        self._components, self._spacing_mm, self._max_samples = components, spacing_mm, max_samples
+        self._known: dict[int, tuple[Array, cKDTree]] = {}
+
+    def counterparts(self, turned: Array, near_mm: float, min_same: float) -> NDArray[np.int64]:
+        """(C,) index of the component on whose surface each one lies after a turn (4,4), or -1."""
+        found = np.full(len(self._components), -1)
+        boxes = np.array([one.bounds_in_model for one in self._components])
+        for c, one in enumerate(self._components):
+            moved = apply(turned, one.vertices_in_model)
+            box = np.stack([moved.min(axis=0), moved.max(axis=0)])
+            for d in np.flatnonzero(np.abs(boxes - box).max(axis=(1, 2)) < near_mm):
+                if _same_share(self._of(int(d))[1], apply(turned, self._of(c)[0]), near_mm) >= min_same:
+                    found[c] = d
+        return found
+
+    def _of(self, index: int) -> tuple[Array, cKDTree]:
+        if index not in self._known:
+            points = sample_surface(self._components[index], self._spacing_mm, self._max_samples).points
+            self._known[index] = points, cKDTree(points)
+        return self._known[index]

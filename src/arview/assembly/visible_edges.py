@@ -6,18 +6,19 @@ few directions again and again. Points where another component could be mistaken
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.cad.model import Model
+from arview.cad.model import Model, make_model
 from arview.core.kernel import kernel
 from arview.geometry import Array, apply
 from arview.guideviews import GuideViewSet
 from arview.guideviews.mesh_edges import facing, mesh_edges
 from arview.rendering.renderers import ZBufferRenderer
+from arview.rendering.rendering import Rendering
 
 INITIAL_SAMPLES = 4096
 """Samples for which memory is reserved at first; it doubles when it is full."""
@@ -112,31 +113,69 @@ class VisibleEdgeCache:
 
     def __init__(self, views: GuideViewSet, model: Model, options: VisibleEdgeOptions | None = None) -> None:
         self.options = options or VisibleEdgeOptions()
-        self._views = views
+        self._views, self._model = views, model
         self._count = len(model.components)
         self._renderer = ZBufferRenderer(model, views.camera)
         edges = mesh_edges(model, views.options.crease_angle_deg)
         self._mesh = _Mesh(
             edges.vertices_in_model, edges.ends, edges.faces, edges.is_sharp, edges.face_normals, edges.component
         )
-        self._cached: dict[int, VisibleEdges] = {}
+        self._cached: dict[tuple[int, bytes], VisibleEdges] = {}
+        self._without: tuple[bytes, ZBufferRenderer, NDArray[np.int16]] | None = None
 
-    def nearest(self, cam_from_model: Array) -> VisibleEdges:
-        """Visible edges of the guide view whose direction is nearest to a pose (4,4)."""
+    def nearest(self, cam_from_model: Array, is_absent: NDArray[np.bool_] | None = None) -> VisibleEdges:
+        """Visible edges of the guide view whose direction is nearest to a pose (4,4).
+
+        Args:
+            cam_from_model: (4,4).
+            is_absent: (C,) components that are not there: they hide nothing, and edges of others are not near theirs.
+                Their own edges are those of the complete part. None: all are there.
+        """
         index = self._views.nearest_index(cam_from_model)
-        if index not in self._cached:
+        absent = is_absent.tobytes() if is_absent is not None and is_absent.any() else b""
+        key = (index, absent)
+        if key not in self._cached:
             if len(self._cached) >= self.options.max_cached:
                 del self._cached[next(iter(self._cached))]
-            self._cached[index] = self._sampled(self._views.poses[index])
-        return self._cached[index]
+            pose = self._views.poses[index]
+            if is_absent is None or not absent:
+                self._cached[key] = self._sampled(pose, self._renderer.render(pose), self._mesh)
+            else:
+                self._cached[key] = self._sampled_without(cam_from_model, pose, is_absent)
+        return self._cached[key]
 
-    def _sampled(self, cam_from_model: Array) -> VisibleEdges:
+    def _sampled_without(self, cam_from_model: Array, view_pose: Array, is_absent: NDArray[np.bool_]) -> VisibleEdges:
+        """As `nearest` for some absent components, for the guide view of a pose (4,4)."""
+        complete, absent, mesh = self.nearest(cam_from_model), is_absent.tobytes(), self._mesh
+        if self._without is None or self._without[0] != absent:
+            kept = np.flatnonzero(~is_absent)
+            model = make_model(self._model.name, tuple(self._model.components[index] for index in kept))
+            # The last number is that of the background, -1.
+            self._without = absent, ZBufferRenderer(model, self._views.camera), np.append(kept, -1).astype(np.int16)
+        _, renderer, names = self._without
+        drawn = renderer.render(view_pose)
+        is_kept = ~is_absent[mesh.component]
+        left = mesh._replace(
+            ends=mesh.ends[is_kept], faces=mesh.faces[is_kept], is_sharp=mesh.is_sharp[is_kept],
+            component=mesh.component[is_kept],
+        )  # fmt: skip
+        found = self._sampled(view_pose, replace(drawn, component_ids=names[drawn.component_ids]), left)
+        is_own = is_absent[complete.component]
+        both = [np.concatenate([a, b[is_own]]) for a, b in zip(found[:5], complete[:5], strict=True)]
+        order = np.argsort(both[2], kind="stable")
+        points, tangents, component, sides, own = (one[order] for one in both)
+        return VisibleEdges(points, tangents, component, sides, own, self._starts(component))
+
+    def _starts(self, component: NDArray[np.int16]) -> NDArray[np.int64]:
+        """(C+1,) index of the first point of each component, of those (N,) of sorted points."""
+        return np.searchsorted(component, np.arange(self._count + 1)).astype(np.int64)
+
+    def _sampled(self, cam_from_model: Array, image: Rendering, mesh: _Mesh) -> VisibleEdges:
         o, camera, center_in_model = self.options, self._views.camera, self._views.center_in_model
-        image = self._renderer.render(cam_from_model)
         ids = image.component_ids
         tolerance_mm = o.tolerance_px * float(apply(cam_from_model, center_in_model)[2]) / camera.fx
         rendering = _Rendering(cam_from_model, camera.fx, camera.cx, ids, image.depth_mm, tolerance_mm)
-        samples = _sample_edges(self._mesh, rendering)
+        samples = _sample_edges(mesh, rendering)
         order = np.argsort(samples.component, kind="stable")
         is_own = _own_samples(samples, rendering, o.shared_px, o.shared_cos, o.occluder_px)
         beside = [np.round(samples.pixels + sign * o.side_px * samples.normals_px).astype(np.intp) for sign in (-1, 1)]
@@ -148,7 +187,7 @@ class VisibleEdgeCache:
             component=component,
             sides=np.stack([ids[place[:, 1], place[:, 0]] for place in beside], axis=1)[order],
             is_own=is_own[order],
-            starts=np.searchsorted(component, np.arange(self._count + 1)).astype(np.int64),
+            starts=self._starts(component),
         )
 
 

@@ -39,7 +39,7 @@ from arview.tracking.pose_recheck import LocalSearchRecheck
 from arview.tracking.search_plan import SearchPlan
 from arview.tracking.session_options import SessionOptions
 from arview.tracking.session_state import Event, SessionState
-from arview.tracking.several.specimens import hide_specimens, is_same_specimen
+from arview.tracking.several.specimens import CoveredPlace, hide_specimens, is_same_specimen
 from arview.tracking.tracker import Tracker
 from arview.tracking.tracker_options import TrackerOptions
 
@@ -68,6 +68,7 @@ class TrackingSession:
         views: guide views of the model.
         frames, camera: how frames become the pictures that are tracked, and the camera of these.
         others: poses (4,4) of other specimens of the part, which are not taken for this one.
+        covers: where other parts are, at which this one is searched for in every second round of searches only.
         identity: says whether the specimen in view is the one that was followed.
 
     Raises:
@@ -100,6 +101,7 @@ class TrackingSession:
         self.camera = camera = self.frames.tracked_camera
         self.views = views
         self.others: tuple[Array, ...] = ()
+        self.covers: tuple[CoveredPlace, ...] = ()
         self._local: LocalSearch = local_search_for(views, camera, o.detector) if like is None else like._local
         self.tracker = Tracker(
             views,
@@ -288,7 +290,7 @@ class TrackingSession:
             return self._align(image, self._guide)
         searches = self._search_plan.searches(image, s, self.detector)
         is_resting = searches == []
-        searched = hide_specimens(image, self.others, self.views, self.camera)
+        searched = self._uncovered(image)
         detections = self._detect_remembered(searched) if is_resting else self._detect(searched, searches)
         detections = [one for one in detections if not self._is_other(one.cam_from_model)]
         reason = ""
@@ -312,6 +314,14 @@ class TrackingSession:
         if self._guide is not None and self.is_aligning:
             return self._align(image, self._guide)
         return None, s.reason
+
+    def _uncovered(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """The picture that is searched: without other specimens, and in every second round without other parts."""
+        searched = hide_specimens(image, self.others, self.views, self.camera)
+        if self._state.frames_without_pose // (2 * self.options.search_every) % 2 == 0:
+            for one in self.covers:
+                searched = hide_specimens(searched, [one.cam_from_model], one.views, self.camera)
+        return searched
 
     def _begin_detected(
         self, image: NDArray[np.uint8], found: Detection, lock_quality: float

@@ -1,7 +1,8 @@
 """SeveralSessions: tracks several parts, or several specimens of one part, in one stream.
 
 Each has a session of its own. Two specimens are never at one place: what is tracked is hidden from the search for the
-others, and of two sessions that meet the younger one gives way. At most one session searches in a frame, in turn, and
+others, and of two sessions that meet the younger one gives way. Other parts that are tracked are hidden only in every
+second round of searches, because a part may stand on another. At most one session searches in a frame, in turn, and
 rarely while others are tracked, so that a frame takes about as long as with one part.
 """
 
@@ -15,9 +16,9 @@ from numpy.typing import NDArray
 
 from arview.errors import InputError
 from arview.geometry import Array
-from arview.pose import Pose
+from arview.pose import Pose, TrackingState
 from arview.tracking.session import TrackingSession
-from arview.tracking.several.specimens import is_same_specimen
+from arview.tracking.several.specimens import CoveredPlace, is_same_specimen
 
 
 class SeveralSessions:
@@ -61,7 +62,7 @@ class SeveralSessions:
         # What is tracked comes first, because it is hidden from the search.
         for name in (*(one for one in self.sessions if one not in self._without_pose()), *searching):
             session = self.sessions[name]
-            session.others = self._others(name)
+            session.others, session.covers = self._others(name), self._covers(name)
             self._poses[name] = replace(session.process(image, index, time_s), instance=name)
         for name in self._without_pose():
             if name not in searching:
@@ -98,6 +99,18 @@ class SeveralSessions:
         own = self.sessions[name].views
         poses = (self._poses.get(other) for other, one in self.sessions.items() if other != name and one.views is own)
         return tuple(pose.cam_from_model for pose in poses if pose is not None and pose.cam_from_model is not None)
+
+    def _covers(self, name: str) -> tuple[CoveredPlace, ...]:
+        """Where other parts are tracked without doubt, which need not be searched for this one."""
+        own = self.sessions[name].views
+        found = []
+        for other, one in self.sessions.items():
+            pose = self._poses.get(other)
+            is_sure = pose is not None and pose.state is TrackingState.TRACKED
+            if other != name and one.views is not own and pose is not None and is_sure:
+                assert pose.cam_from_model is not None
+                found.append(CoveredPlace(pose.cam_from_model, one.views))
+        return tuple(found)
 
     def _separate(self) -> None:
         """Where two sessions follow one specimen, the one that has followed for longer keeps it."""

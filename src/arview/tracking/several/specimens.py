@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -35,6 +36,13 @@ class SpecimenOptions:
 
 
 DEFAULT = SpecimenOptions()
+
+
+class CoveredPlace(NamedTuple):
+    """Where another part is: its pose (4,4), and its guide views."""
+
+    cam_from_model: Array
+    views: GuideViewSet
 
 
 def specimen_names(part_names: Sequence[str]) -> list[str]:
