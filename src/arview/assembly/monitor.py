@@ -115,6 +115,7 @@ class AssemblyMonitor:
     """
 
     _state: MonitorState
+    _is_resumed: bool
 
     def __init__(
         self,

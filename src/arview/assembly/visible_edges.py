@@ -121,7 +121,7 @@ class VisibleEdgeCache:
             edges.vertices_in_model, edges.ends, edges.faces, edges.is_sharp, edges.face_normals, edges.component
         )
         self._cached: dict[tuple[int, bytes], VisibleEdges] = {}
-        self._without: tuple[bytes, ZBufferRenderer, NDArray[np.int16]] | None = None
+        self._incomplete: tuple[bytes, ZBufferRenderer, NDArray[np.int16]] | None = None
 
     def nearest(self, cam_from_model: Array, is_absent: NDArray[np.bool_] | None = None) -> VisibleEdges:
         """Visible edges of the guide view whose direction is nearest to a pose (4,4).
@@ -147,12 +147,12 @@ class VisibleEdgeCache:
     def _sampled_without(self, cam_from_model: Array, view_pose: Array, is_absent: NDArray[np.bool_]) -> VisibleEdges:
         """As `nearest` for some absent components, for the guide view of a pose (4,4)."""
         complete, absent, mesh = self.nearest(cam_from_model), is_absent.tobytes(), self._mesh
-        if self._without is None or self._without[0] != absent:
+        if self._incomplete is None or self._incomplete[0] != absent:
             kept = np.flatnonzero(~is_absent)
             model = make_model(self._model.name, tuple(self._model.components[index] for index in kept))
             # The last number is that of the background, -1.
-            self._without = absent, ZBufferRenderer(model, self._views.camera), np.append(kept, -1).astype(np.int16)
-        _, renderer, names = self._without
+            self._incomplete = absent, ZBufferRenderer(model, self._views.camera), np.append(kept, -1).astype(np.int16)
+        _, renderer, names = self._incomplete
         drawn = renderer.render(view_pose)
         is_kept = ~is_absent[mesh.component]
         left = mesh._replace(

@@ -48,7 +48,7 @@ class OwnMotionOptions:
 
     Attributes:
         frames: frames before the gap over which the motion is taken.
-        doubtful: the last of them whose poses may have been wrong.
+        wrong_frames: the last of them whose poses may have been wrong.
         max_gap: frames without a sure pose up to which it is continued.
         near: shift in diameters from the expected place, across the line of sight, up to which the part is there.
         near_depth: the same along the line of sight.
@@ -57,7 +57,7 @@ class OwnMotionOptions:
     """
 
     frames: int = 7
-    doubtful: int = 2
+    wrong_frames: int = 2
     max_gap: int = 15
     near: float = 0.2
     near_depth: float = 0.6

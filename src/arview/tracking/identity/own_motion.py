@@ -43,7 +43,7 @@ class OwnMotion:
         The last poses before a loss may have been wrong already: it is enough that those before them lead there.
         """
         shown = list(self._recent)
-        ends = range(len(shown), max(len(shown) - self._options.doubtful - 1, 1), -1)
+        ends = range(len(shown), max(len(shown) - self._options.wrong_frames - 1, 1), -1)
         return any(self._is_on_way(shown[0], shown[end - 1], (frame, cam_from_model)) for end in ends)
 
     def _is_on_way(self, before: tuple[int, Array], last: tuple[int, Array], found: tuple[int, Array]) -> bool:
