@@ -161,10 +161,16 @@ class VisibleEdgeCache:
         )  # fmt: skip
         found = self._sampled(view_pose, replace(drawn, component_ids=names[drawn.component_ids]), left)
         is_own = is_absent[complete.component]
-        both = [np.concatenate([a, b[is_own]]) for a, b in zip(found[:5], complete[:5], strict=True)]
-        order = np.argsort(both[2], kind="stable")
-        points, tangents, component, sides, own = (one[order] for one in both)
-        return VisibleEdges(points, tangents, component, sides, own, self._starts(component))
+        component = np.concatenate([found.component, complete.component[is_own]])
+        order = np.argsort(component, kind="stable")
+        return VisibleEdges(
+            points_in_body=np.concatenate([found.points_in_body, complete.points_in_body[is_own]])[order],
+            tangents=np.concatenate([found.tangents, complete.tangents[is_own]])[order],
+            component=component[order],
+            sides=np.concatenate([found.sides, complete.sides[is_own]])[order],
+            is_own=np.concatenate([found.is_own, complete.is_own[is_own]])[order],
+            starts=self._starts(component[order]),
+        )
 
     def _starts(self, component: NDArray[np.int16]) -> NDArray[np.int64]:
         """(C+1,) index of the first point of each component, of those (N,) of sorted points."""
