@@ -5,7 +5,7 @@ import { t } from "../texts/texts.js";
 import { getCells, takeAtStation } from "./api.js";
 import { Dome } from "./dome.js";
 import { Needs } from "./needs.js";
-import { takePhoto } from "./photo.js";
+import { asJpeg, takePhoto } from "./photo.js";
 import { allowSound, signal } from "./signals.js";
 import { counts, verdictWord } from "./verdicts.js";
 
@@ -55,7 +55,7 @@ export class CaptureView {
     });
     this.done = button("hud-done", "tracked", "job.done", () => this.events.onEnd());
     this.leave = button("hud-leave", "close", "job.leave", () => this.events.onLeave());
-    this.files = make("input", "", [], { type: "file", accept: "image/jpeg", capture: "environment", multiple: "", hidden: "", "aria-label": t("job.file") });
+    this.files = make("input", "", [], { type: "file", accept: "image/jpeg,image/png", capture: "environment", multiple: "", hidden: "", "aria-label": t("job.file") });
     this.files.addEventListener("change", () => this.#addFiles());
     this.pick = button("hud-pick", "camera", "job.file", () => this.files.click());
     this.element = make("div", "", [
@@ -171,7 +171,9 @@ export class CaptureView {
   async #addFiles() {
     const { job } = this;
     for (const file of this.files.files) {
-      await this.queue.add(job.id, file, { source: "upload", taken: new Date(file.lastModified || Date.now()).toISOString(), hint: null });
+      const jpeg = await asJpeg(file).catch(() => null);
+      if (jpeg) await this.queue.add(job.id, jpeg, { source: "upload", taken: new Date(file.lastModified || Date.now()).toISOString(), hint: null });
+      else this.events.onTrouble(t("job.not_jpeg", { name: file.name }));
     }
     this.files.value = "";
   }

@@ -57,7 +57,7 @@ class JobPage {
         this.#show("results");
       }),
     });
-    this.stale = make("p", "job-remark", [icon("offline"), make("span", "", [t("job.stale")])], { role: "alert" });
+    this.stale = make("p", "job-remark job-stale", [icon("offline"), make("span", "", [t("job.stale")])], { role: "alert" });
     this.stale.hidden = true;
     this.body = make("div", "job-body");
     this.section.append(make("h2", "", [t("job.title_section")]), this.stale, this.body);

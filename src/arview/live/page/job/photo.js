@@ -27,6 +27,26 @@ async function fullSize(track) {
   const size = imageWidth?.max && imageHeight?.max ? { imageWidth: imageWidth.max, imageHeight: imageHeight.max } : undefined;
   const blob = await capture.takePhoto(size).catch((error) => (size ? capture.takePhoto() : Promise.reject(error)));
   if (!blob?.size) throw new NoPhoto("empty photo");
+  return asJpeg(blob);
+}
+
+/** A picture as JPEG, which is what the station takes; throws where the browser cannot read it. */
+export async function asJpeg(blob) {
+  if (blob.type === "image/jpeg") return blob;
+  const picture = await createImageBitmap(blob);
+  try {
+    return await encoded(picture, picture.width, picture.height);
+  } finally {
+    picture.close();
+  }
+}
+
+async function encoded(source, width, height) {
+  const canvas = document.createElement("canvas");
+  [canvas.width, canvas.height] = [width, height];
+  canvas.getContext("2d", { alpha: false }).drawImage(source, 0, 0);
+  const blob = await new Promise((resolve) => canvas.toBlob(resolve, "image/jpeg", QUALITY));
+  if (!blob) throw new NoPhoto("no picture");
   return blob;
 }
 
@@ -51,13 +71,8 @@ async function fromStream(track, video) {
 }
 
 async function still(video) {
-  const canvas = document.createElement("canvas");
-  [canvas.width, canvas.height] = [video.videoWidth, video.videoHeight];
-  if (!canvas.width) throw new NoPhoto("no picture");
-  canvas.getContext("2d", { alpha: false }).drawImage(video, 0, 0);
-  const blob = await new Promise((resolve) => canvas.toBlob(resolve, "image/jpeg", QUALITY));
-  if (!blob) throw new NoPhoto("no picture");
-  return blob;
+  if (!video.videoWidth) throw new NoPhoto("no picture");
+  return encoded(video, video.videoWidth, video.videoHeight);
 }
 
 const once = (target, name, withinMs) => new Promise((resolve) => {

@@ -1,0 +1,228 @@
+"""The inspection as a job on the page, with a station that answers as told: photos that get lost, results, signature."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from arview.live.server import app
+from arview.live.stream import documents
+from arview.live.transport import webrtc
+from helpers import live_browser
+from helpers.live_client import Running, running
+from helpers.live_sample import INSPECTION, loader, options
+from helpers.page import WATCH, opened, until
+from helpers.told_jobs import CELLS, ToldJobs
+
+WIDTH, HEIGHT, FPS = 640, 360, 5
+PHONE = {"width": 390, "height": 844}
+JOB = "job_BP-0012"
+ADVICE: dict[str, Any] = {}
+"""What every pose says of the capture."""
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def chromium(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+    film = tmp_path_factory.mktemp("film") / "part.y4m"
+    images = live_browser.frames(WIDTH, HEIGHT)
+    live_browser.write_y4m(film, [images[k] for k in live_browser.there_and_back()], FPS)
+    with live_browser.browser(film) as running_browser:
+        yield running_browser
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[Running]:
+    plain = documents.pose_document
+
+    def told(*of: Any, **more: Any) -> dict[str, Any]:
+        return {**plain(*of, **more), **({"capture": dict(ADVICE)} if ADVICE else {})}
+
+    with pytest.MonkeyPatch.context() as patch:
+        for module in (app, webrtc):
+            patch.setattr(module, "pose_document", told)
+        chosen = options(inspection=None, clients=4)
+        with running(chosen, loader(chosen)) as one:
+            yield one
+
+
+@pytest.fixture
+def jobs() -> Iterator[ToldJobs]:
+    ADVICE.clear()
+    yield ToldJobs()
+    ADVICE.clear()
+
+
+def capture(page: Any, jobs: ToldJobs) -> dict[str, Any]:
+    """Start a job, and wait until photos can be taken; returns its document."""
+    jobs.attach(page)
+    until(page, "window.drawn?.pose?.state === 'tracked'")
+    page.click("#open-job")
+    page.fill("#job-serial", "BP-0012")
+    page.locator("#job .primary").click()
+    page.wait_for_selector("#job-hud .shutter:not([hidden])")
+    return jobs.jobs[JOB]
+
+
+def advise(**more: Any) -> None:
+    """Let the poses say something of the capture."""
+    usual = {"job": JOB, "take_id": 0, "takes": False, "text": "from the left", "reason": "", "progress": 0.3}
+    cells = "1" + "2" * (len(CELLS) - 1)
+    ADVICE.update({**usual, "is_enough": False, "distance": "good", "cells": cells, **more})
+
+
+def components() -> list[dict[str, Any]]:
+    """The sample's components as a job has them."""
+    record = json.loads(INSPECTION.read_text())["components"]
+    keys = ("name", "verdict", "distance_mm", "uncertainty_mm")
+    more = {"detail_text": "", "value_text": "0.10 mm"}
+    return [{**{key: one[key] for key in keys}, **more} for one in record]
+
+
+def state(page: Any) -> str:
+    return str(page.inner_text(".hud-state"))
+
+
+def test_sha256_without_a_secure_context(chromium: Any, server: Running) -> None:
+    contents = [bytes(range(256)) * 40, b"", b"abc", b"x" * 55, b"x" * 56, b"x" * 64, b"y" * 119, b"z" * 100_001]
+    with opened(chromium, server) as page:
+        found = page.evaluate(
+            """async (contents) => {
+              const { plainSha256, sha256 } = await import("/static/job/hash.js");
+              const hex = (bytes) => Array.from(bytes, (one) => one.toString(16).padStart(2, "0")).join("");
+              return Promise.all(contents.map(async (one) => {
+                const bytes = Uint8Array.from(one);
+                return [hex(plainSha256(bytes)), await sha256(bytes.buffer)];
+              }));
+            }""",
+            [list(one) for one in contents],
+        )
+    assert found == [[hashlib.sha256(one).hexdigest()] * 2 for one in contents]
+
+
+def test_photos_survive_a_reload_and_arrive_once(chromium: Any, server: Running, jobs: ToldJobs) -> None:
+    with opened(chromium, server, WATCH, PHONE) as page:
+        job = capture(page, jobs)
+        jobs.is_gone = True
+        for count in (1, 2):
+            page.click("#job-hud .shutter")
+            until(page, lambda count=count: f"No connection: {count} kept on this device" in state(page))
+        assert not jobs.stored and "stored" not in state(page), "nothing is called stored before the station says so"
+        page.reload()
+        until(page, lambda: page.locator("#open-job").count() == 1)
+        page.wait_for_timeout(1500)
+        assert not jobs.stored
+        jobs.is_gone = False
+        until(page, lambda: len(jobs.stored) == 2)
+        until(page, lambda: page.locator("#job-hud").is_visible() and "All stored" in state(page))
+        page.wait_for_timeout(1500)
+    assert len(jobs.stored) == 2 and job["photos"] == ["0001.jpg", "0002.jpg"]
+    assert all(one[:3] == b"\xff\xd8\xff" for one in jobs.stored)
+
+
+def test_a_photo_that_arrives_damaged_is_sent_again(chromium: Any, server: Running, jobs: ToldJobs) -> None:
+    with opened(chromium, server, WATCH, PHONE) as page:
+        capture(page, jobs)
+        jobs.refusals = [
+            (409, {"error": "bad_offset", "message": "another offset", "offset": 0}),
+            (503, {"error": "busy", "message": "busy"}),
+            (422, {"error": "bad_hash", "message": "damaged"}),
+        ]
+        page.click("#job-hud .shutter")
+        until(page, lambda: len(jobs.stored) == 1)
+        jobs.refusals = [(507, {"error": "disk_full", "message": "full"})]
+        page.click("#job-hud .shutter")
+        until(page, lambda: "disk is full: 1 kept on this device" in state(page))
+        until(page, lambda: len(jobs.stored) == 2)
+    about = [one for one in jobs.begun.values()]
+    digests = [hashlib.sha256(one).hexdigest() for one in jobs.stored]
+    assert [one["sha256"] for one in about] == digests
+
+
+def test_a_photo_is_taken_by_itself_once_for_each_number(chromium: Any, server: Running, jobs: ToldJobs) -> None:
+    advise()
+    with opened(chromium, server, WATCH, PHONE) as page:
+        capture(page, jobs)
+        until(page, lambda: page.locator("#job-hud .dome circle.wanted").count() == len(CELLS) - 1)
+        page.wait_for_timeout(1000)
+        assert not jobs.stored
+        for number in (1, 2):
+            advise(takes=True, take_id=number)
+            until(page, lambda number=number: len(jobs.stored) == number)
+            page.wait_for_timeout(1200)
+            assert len(jobs.stored) == number
+        assert page.inner_text(".hud-count").startswith("2 of 20")
+    for about in jobs.begun.values():
+        assert about["source"] == "still" and about["media_type"] == "image/jpeg"
+        assert len(about["hint"]["cam_from_model"]) == 16 and about["hint"]["camera"]["width"] == WIDTH
+
+
+def test_result_comes_without_a_reload_and_is_signed(chromium: Any, server: Running, jobs: ToldJobs) -> None:
+    with opened(chromium, server, WATCH, PHONE) as page:
+        job = capture(page, jobs)
+        page.click("#job-hud .shutter")
+        page.click("#job-hud .hud-done")
+        until(page, lambda: ("end", {}) in jobs.said and len(jobs.stored) == 1)
+        until(page, lambda: "placing photos" in page.inner_text("#job"))
+        found = {"verdict": "fail", "sentence": "1 of 11 is out of tolerance", "components": components(), "created": ""}
+        job.update(inspection=found, state={**job["state"], "is_rough": True})
+        until(page, lambda: "PROVISIONAL" in page.inner_text("#job .job-banner"))
+        step = {"component": "post_1", "how": "unbolt", "moves": [{"text": "Move it 1.4 mm towards nut_1"}], "turn": None}
+        job["rework"] = [{**step, "steps": ["Loosen", "Push"], "remark": "", "pictures": []}]
+        job["state"] = {**job["state"], "stage": "done", "is_rough": False, "cloud": "done"}
+        until(page, lambda: "FAIL" in page.inner_text("#job .job-banner .what"))
+
+        page.click("#job .component[data-name=post_1]")
+        assert "Move it 1.4 mm towards nut_1" in page.inner_text("#job .job-moves")
+        until(page, "document.querySelector('#job .job-drawing').naturalWidth > 0")
+        page.fill("#job-note", "bent in transport")
+        page.fill("#job-tick-by", "M. Lang")
+        page.check("#job-step-1")
+        until(page, lambda: any(name == "ticks" for name, _ in jobs.said))
+        page.wait_for_timeout(2500)
+        assert page.input_value("#job-note") == "bent in transport", "what is typed stays while news arrive"
+        page.check("#job-ok-no")
+        page.fill("#job-reason", "Scrap")
+        page.fill("#job-by", "M. Lang")
+        page.locator("#job .job-form .primary").click()
+        until(page, lambda: "Not OK by M. Lang" in page.inner_text("#job .component[data-name=post_1]"))
+        page.locator("#job .job-ends .primary").click()
+        assert "nut_1" in page.inner_text("#job .job-view .job-remark"), "who signs is told what has no decision"
+        page.locator("#job .primary").click()
+        until(page, lambda: "Signed by M. Lang" in page.inner_text("#job"))
+        jobs.is_gone = True
+        until(page, lambda: "may be out of date" in page.inner_text("#job"))
+    said = dict(jobs.said)
+    decision = {"component": "post_1", "is_ok": False, "reason": "Scrap", "by": "M. Lang", "photo": None}
+    assert said["decisions"] == {**decision, "note": "bent in transport"}
+    assert said["ticks"] == {"component": "post_1", "step": 1, "is_done": True, "by": "M. Lang"}
+    assert said["sign"] == {"by": "M. Lang", "note": ""}
+
+
+def test_check_again_shows_before_and_after(chromium: Any, server: Running, jobs: ToldJobs) -> None:
+    found = {"verdict": "fail", "sentence": "", "components": components(), "created": ""}
+    with opened(chromium, server, WATCH, PHONE) as page:
+        job = capture(page, jobs)
+        rework = {"component": "post_1", "how": "", "moves": [], "turn": None, "steps": [], "remark": "", "pictures": []}
+        job.update(inspection=found, rework=[rework], state={**job["state"], "stage": "done", "cloud": "done"})
+        page.click("#job .component[data-name=post_1]")
+        page.locator("#job .primary", has_text="Check again").click()
+        page.wait_for_selector("#job-hud .shutter:not([hidden])")
+        again = jobs.jobs[f"{JOB}_r1"]
+        assert again["components"] == ["post_1"]
+        page.click("#job-hud .shutter")
+        page.click("#job-hud .hud-done")
+        until(page, lambda: again["state"]["stage"] == "measuring")
+        row = {"name": "post_1", "before_mm": 1.36, "after_mm": 0.04, "verdict_before": "fail", "verdict_after": "pass"}
+        one = [one for one in components() if one["name"] == "post_1"]
+        again.update(before_after=[row], inspection={**found, "verdict": "pass", "components": one})
+        again["state"] = {**again["state"], "stage": "done", "cloud": "done"}
+        until(page, lambda: "0.04 mm" in page.inner_text("#job .before-after .is"))
+        assert "1.36 mm" in page.inner_text("#job .before-after .was")
+        page.locator("#job .primary", has_text="Result").click()
+        until(page, lambda: "1.36 → 0.04 mm, PASS" in page.inner_text("#job .component[data-name=post_1]"))
+
