@@ -32,6 +32,7 @@ class ToldJobs:
         stored: content of the photos that arrived, in order.
         uploads: content so far by the name of an upload.
         refusals: the next answers to pieces: status and document; an empty list answers as a station does.
+        lost: number of the next pieces that arrive while their answers do not.
         is_gone: no request is answered.
     """
 
@@ -41,6 +42,7 @@ class ToldJobs:
     begun: dict[str, dict[str, Any]] = field(default_factory=dict)
     refusals: list[tuple[int, dict[str, Any]]] = field(default_factory=list)
     said: list[tuple[str, dict[str, Any]]] = field(default_factory=list)
+    lost: int = 0
     is_gone: bool = False
 
     def attach(self, page: Any) -> None:
@@ -124,6 +126,9 @@ class ToldJobs:
         if offset != len(kept):
             return 409, {"error": "bad_offset", "message": "another offset", "offset": len(kept)}
         kept += content
+        if self.lost:
+            self.lost -= 1
+            return 503, {"error": "busy", "message": "busy"}
         about = self.begun[upload]
         if len(kept) < about["bytes"]:
             return 200, {"offset": len(kept)}

@@ -179,6 +179,7 @@ export class CaptureView {
   }
 
   #draw() {
+    if (!this.job) return;
     const { job, queue } = this, isFresh = performance.now() - this.#adviceMs < SILENT_MS, advice = this.#advice;
     const isTracked = isFresh && Boolean(this.#pose?.isPosed);
     const put = (element, text) => { if (element.textContent !== text) element.textContent = text; };

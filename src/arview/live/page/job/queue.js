@@ -169,4 +169,4 @@ export class UploadQueue {
 }
 
 /** Whether a refusal will be the same again: the photo, or its job, is wrong. */
-const isFinal = ({ status, code }) => code === "bad_hash" || [400, 404, 409, 413, 415, 422].includes(status);
+const isFinal = ({ status, code }) => code === "bad_hash" || code !== "bad_offset" && [400, 404, 409, 413, 415, 422].includes(status);
