@@ -4,6 +4,7 @@ import { icon, make } from "../icons.js";
 import { t } from "../texts/texts.js";
 import { getCells, takeAtStation } from "./api.js";
 import { Dome } from "./dome.js";
+import { Motion } from "./motion.js";
 import { Needs } from "./needs.js";
 import { asJpeg, takePhoto } from "./photo.js";
 import { allowSound, signal } from "./signals.js";
@@ -28,6 +29,7 @@ export class CaptureView {
     Object.assign(this, { host, queue, events });
     this.job = null;
     this.dome = new Dome();
+    this.motion = new Motion((rate) => host.connection.link?.tell({ type: "motion", gyro_rad_s: rate }));
     this.#build();
     this.needs = new Needs(host.layer, (part, point) => host.stage.toScreen(part, point));
   }
@@ -86,6 +88,7 @@ export class CaptureView {
     this.wanted = null;
     this.needs.setComponents(document.components, part);
     this.element.hidden = false;
+    this.motion.start();
     this.refresh(job);
     try {
       const cells = await getCells(job.id);
@@ -100,6 +103,7 @@ export class CaptureView {
 
   close() {
     this.job = null;
+    this.motion.stop();
     this.element.hidden = true;
     this.needs.clear();
   }

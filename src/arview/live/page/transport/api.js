@@ -41,7 +41,8 @@ export async function ask(path, { method = "GET", json, body, headers = {}, keep
   );
 }
 
-export const getPart = async () => (await ask("/api/part")).json();
+/** The parts; of a client that is in a job, with the numbers of that job. */
+export const getPart = async (client = null) => (await ask(client ? `/api/part?client=${client}` : "/api/part")).json();
 export const getModel = async (id) => (await ask(`/api/model.glb?part=${id}`)).arrayBuffer();
 
 /** The parts of a *Part* or *Pose* document: their list, or the document itself where there is only one. */

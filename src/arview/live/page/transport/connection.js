@@ -127,7 +127,7 @@ export class Connection {
   }
 
   async #refreshPart() {
-    const part = await getPart();
+    const part = await getPart(this.link?.client);
     if (part.state === "loading") throw new Refusal(503, "loading", part.text);
     if (part.state === "failed") throw new Refusal(503, "failed", part.text);
     this.#part = part;

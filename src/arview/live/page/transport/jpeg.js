@@ -32,6 +32,13 @@ export class JpegLink {
     this.#waiting?.();
   }
 
+  /** Tell the server something with the next picture: how fast the phone turns. */
+  tell({ type, gyro_rad_s: gyro }) {
+    if (type === "motion") this.#gyro = gyro;
+  }
+
+  #gyro = null;
+
   close() {
     this.#abort.abort();
     this.#waiting?.();
@@ -79,8 +86,9 @@ export class JpegLink {
     this.inFlight = frame;
     const body = await new Promise((resolve) => frame.canvas.toBlob(resolve, "image/jpeg", QUALITY));
     if (signal.aborted) return -1;
-    const sentMs = performance.now();
-    const answer = await ask(`/api/clients/${this.client}/frame?id=${id}&turns=${turns}`, {
+    const sentMs = performance.now(), gyro = this.#gyro;
+    this.#gyro = null;
+    const answer = await ask(`/api/clients/${this.client}/frame?id=${id}&turns=${turns}${gyro === null ? "" : `&gyro=${gyro.toFixed(4)}`}`, {
       method: "POST", body, headers: { "Content-Type": "image/jpeg" }, signal,
     });
     this.sent += 1;

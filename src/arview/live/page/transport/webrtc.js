@@ -38,7 +38,7 @@ export class WebrtcLink {
     if (!globalThis.RTCPeerConnection) throw new NoWebrtc("unsupported");
     const peer = (this.peer = new RTCPeerConnection({ iceServers: [] }));
     try {
-      const channel = peer.createDataChannel("arview", { ordered: false, maxRetransmits: 0 });
+      const channel = this.channel = peer.createDataChannel("arview", { ordered: false, maxRetransmits: 0 });
       channel.addEventListener("message", (event) => this.#process(JSON.parse(event.data)));
       channel.addEventListener("close", () => this.#end(t("link.closed")));
       this.#addVideo(peer);
@@ -75,6 +75,11 @@ export class WebrtcLink {
     drawStrip(context, frame);
     this.track.requestFrame?.();
     this.sent += 1;
+  }
+
+  /** Tell the server something that may get lost. */
+  tell(document) {
+    if (this.channel?.readyState === "open") this.channel.send(JSON.stringify(document));
   }
 
   close() {
