@@ -128,7 +128,10 @@ def test_a_photo_that_arrives_damaged_is_sent_again(chromium: Any, server: Runni
     with opened(chromium, server, WATCH, PHONE) as page:
         capture(page, jobs)
         jobs.lost = 1
-        jobs.refusals = [(503, {"error": "busy", "message": "busy"}), (422, {"error": "bad_hash", "message": "damaged"})]
+        jobs.refusals = [
+            (503, {"error": "busy", "message": "busy"}),
+            (422, {"error": "bad_hash", "message": "damaged"}),
+        ]
         page.click("#job-hud .shutter")
         until(page, lambda: len(jobs.stored) == 1)
         jobs.refusals = [(507, {"error": "disk_full", "message": "full"})]
@@ -164,10 +167,20 @@ def test_result_comes_without_a_reload_and_is_signed(chromium: Any, server: Runn
         page.click("#job-hud .hud-done")
         until(page, lambda: ("end", {}) in jobs.said and len(jobs.stored) == 1)
         until(page, lambda: "placing photos" in page.inner_text("#job"))
-        found = {"verdict": "fail", "sentence": "1 of 11 is out of tolerance", "components": components(), "created": ""}
+        found = {
+            "verdict": "fail",
+            "sentence": "1 of 11 is out of tolerance",
+            "components": components(),
+            "created": "",
+        }
         job.update(inspection=found, state={**job["state"], "is_rough": True})
         until(page, lambda: "PROVISIONAL" in page.inner_text("#job .job-banner"))
-        step = {"component": "post_1", "how": "unbolt", "moves": [{"text": "Move it 1.4 mm towards nut_1"}], "turn": None}
+        step = {
+            "component": "post_1",
+            "how": "unbolt",
+            "moves": [{"text": "Move it 1.4 mm towards nut_1"}],
+            "turn": None,
+        }
         job["rework"] = [{**step, "steps": ["Loosen", "Push"], "remark": "", "pictures": []}]
         job["state"] = {**job["state"], "stage": "done", "is_rough": False, "cloud": "done"}
         until(page, lambda: "FAIL" in page.inner_text("#job .job-banner .what"))
@@ -203,7 +216,15 @@ def test_check_again_shows_before_and_after(chromium: Any, server: Running, jobs
     found = {"verdict": "fail", "sentence": "", "components": components(), "created": ""}
     with opened(chromium, server, WATCH, PHONE) as page:
         job = capture(page, jobs)
-        rework = {"component": "post_1", "how": "", "moves": [], "turn": None, "steps": [], "remark": "", "pictures": []}
+        rework = {
+            "component": "post_1",
+            "how": "",
+            "moves": [],
+            "turn": None,
+            "steps": [],
+            "remark": "",
+            "pictures": [],
+        }
         job.update(inspection=found, rework=[rework], state={**job["state"], "stage": "done", "cloud": "done"})
         page.click("#job .component[data-name=post_1]")
         page.locator("#job .primary", has_text="Check again").click()
@@ -221,4 +242,3 @@ def test_check_again_shows_before_and_after(chromium: Any, server: Running, jobs
         assert "1.36 mm" in page.inner_text("#job .before-after .was")
         page.locator("#job .primary", has_text="Result").click()
         until(page, lambda: "1.36 → 0.04 mm, PASS" in page.inner_text("#job .component[data-name=post_1]"))
-
