@@ -1,4 +1,4 @@
-"""The inspection as a job on the page, with a station that answers as told: photos that get lost, results, signature."""
+"""The inspection as a job on the page, with a station that answers as told: lost photos, results, signature."""
 
 from __future__ import annotations
 
