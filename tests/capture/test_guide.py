@@ -109,6 +109,7 @@ def test_a_still_sharp_new_view_is_taken_once(walk: Walk) -> None:
     assert walk.stay(at(25, 35), image=TEXTURE).take_id == 2
 
 
+@pytest.mark.slow
 def test_nothing_is_taken_while_the_camera_moves(walk: Walk) -> None:
     for index in range(100):  # 40° a second
         advice = walk.frame(at(2.0 * index, 35), TEXTURE)
@@ -131,6 +132,7 @@ def test_nothing_is_taken_while_the_picture_is_blurred(walk: Walk) -> None:
     assert walk.stay(at(0, 35), image=TEXTURE).takes
 
 
+@pytest.mark.slow
 def test_a_stream_that_was_sharp_is_not_taken_out_of_focus(walk: Walk) -> None:
     assert walk.stay(at(0, 35), image=TEXTURE).takes
     walk.guide.photo_taken(at(0, 35))
@@ -203,6 +205,7 @@ def test_the_next_place_is_the_one_that_lowers_the_error_most(walk: Walk) -> Non
     assert expected_error(needs._known) @ weights == pytest.approx(after[next_cell])
 
 
+@pytest.mark.slow
 def test_the_text_names_the_side_and_what_is_hidden(walk: Walk) -> None:
     # From +x the camera's right is +y, that is growing azimuth; photos on that side are taken.
     for azimuth in range(0, 181, 18):
@@ -225,6 +228,7 @@ def test_a_component_that_lacks_photos_is_named_where_it_is_hidden(walk: Walk) -
     assert rows["bracket_2"].text == "hidden from here; 4 more photos" and not rows["bracket_2"].is_enough
 
 
+@pytest.mark.slow
 def test_following_the_advice_is_enough_after_the_wanted_photos(walk: Walk) -> None:
     guide, asked = walk.guide, []
     while not guide.needs.is_enough and len(asked) < 45:
@@ -254,6 +258,7 @@ def test_a_component_that_no_photo_can_show_does_not_go_on_for_ever() -> None:
     assert nut.text == "other components hide it from every direction asked for"
 
 
+@pytest.mark.slow
 def test_a_failed_photo_is_asked_for_again(walk: Walk) -> None:
     assert walk.stay(at(0, 35)).take_id == 1
     walk.guide.photo_failed()

@@ -137,8 +137,8 @@ class CaptureNeeds:
         elif not can_be_seen[index]:
             text = "other components hide it from every direction asked for"
         elif not is_enough[index]:
-            lacking = max(1, self._options.coverage.photos_wanted - photos)
-            text = f"{lacking} more photo{'s' * (lacking != 1)}"
+            lacking = self._options.coverage.photos_wanted - photos
+            text = f"{lacking} more photo{'s' * (lacking != 1)}" if lacking > 0 else "more from other sides"
             if cell is not None and not self._dome.is_seen[cell, index]:
                 text = f"hidden from here; {text}"
         predicted = float(u_mm[index]) if photos >= 2 else None

@@ -15,16 +15,19 @@ from arview.cli.common import (
     RENDERER,
     UNIT,
     camera_for,
+    check_profile,
+    likely_cause,
     load_pose,
     main,
     output_path,
     progress_bar,
     refuse_for_several,
+    report_estimate,
     say,
     session_options,
+    start_session,
 )
 from arview.cli.exit_codes import ExitCode, finding_exit_code, presence_exit_code
-from arview.cli.guessed_camera import check_profile, likely_cause, report_estimate
 from arview.core.atomic import unfinished_path, writing_process
 from arview.errors import OutputError
 
@@ -38,8 +41,7 @@ if TYPE_CHECKING:
     from arview.overlay import OverlayOptions, OverlayRenderer
     from arview.overlay.options import EdgeMode
     from arview.tracking import SessionOptions, TrackingSession
-    from arview.tracking.self_calibration.estimator import FocalEstimate
-    from arview.tracking.self_calibration.session import MakeSession, SelfCalibratingSession
+    from arview.tracking.self_calibration.session import SelfCalibratingSession
     from arview.video import FrameSource, VideoSink
     from arview.workflow.specimens import Specimen
 
@@ -274,7 +276,7 @@ def annotate(
         views, guide = _views_and_guide(part, camera, views_path, renderer, guide_name)
         make_session = partial(_session, specimens[0], views, session_options(modalities), guide, first_pose)
         keep = partial(report_estimate, profile=profile, source=source, turns=frames.quarter_turns_clockwise)
-        session, camera_of = _start(make_session, frames, camera, camera_spec is None, views, keep)
+        session, camera_of = start_session(make_session, frames, camera, camera_spec is None, views, keep)
         _load_learned(session, outputs.learned)
         sink = None
         if outputs.video is not None:
@@ -415,33 +417,6 @@ def _session(
     if (named := click.get_current_context().meta.get(NAMED_PART)) is not None:
         session.name_at(*named)
     return session
-
-
-def _start(
-    make_session: MakeSession,
-    frames: FrameSource,
-    camera: Camera,
-    is_guessed: bool,
-    views: GuideViewSet,
-    keep: Callable[[FocalEstimate], None],
-) -> tuple[TrackingSession | SelfCalibratingSession, Callable[[int], Camera]]:
-    """The session for a source, and the camera of each of its frames by index.
-
-    A guessed camera is estimated: of a film in a first pass, of which ``keep`` gets the result, else while it runs.
-    """
-    from arview.annotation import estimate_camera
-    from arview.tracking.self_calibration.session import SelfCalibratingSession
-
-    if not is_guessed:
-        return make_session(camera, None), lambda index: camera
-    following = SelfCalibratingSession(make_session, views, camera)
-    if frames.is_live:
-        return following, following.camera_of
-    with progress_bar("focal length") as progress:
-        estimate = estimate_camera(frames, following, lambda done: progress(done, frames.frame_count or 0))
-    keep(estimate)
-    final = estimate.camera if estimate.is_determined else camera
-    return make_session(final, None), lambda index: final
 
 
 def _load_learned(session: TrackingSession | SelfCalibratingSession, path: Path | None) -> None:

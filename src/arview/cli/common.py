@@ -1,4 +1,4 @@
-"""What the commands share: how errors end a command, common options, progress bars and the writing of files."""
+"""What the commands share: how errors end a command, common options, cameras, progress bars, writing of files."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import json
 import os
 import select
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -25,7 +25,10 @@ from arview.version import __version__
 if TYPE_CHECKING:
     from arview.camera import Camera
     from arview.geometry import Array
-    from arview.tracking import SessionOptions
+    from arview.guideviews import GuideViewSet
+    from arview.tracking import SessionOptions, TrackingSession
+    from arview.tracking.self_calibration.estimator import FocalEstimate
+    from arview.tracking.self_calibration.session import MakeSession, SelfCalibratingSession
     from arview.video import FrameSource
 
 MODALITIES = ("region", "edge", "feature")
@@ -290,6 +293,33 @@ def camera_for(frames: FrameSource, spec: str | None, source: str) -> Camera:
     return camera
 
 
+def start_session(
+    make_session: MakeSession,
+    frames: FrameSource,
+    camera: Camera,
+    is_guessed: bool,
+    views: GuideViewSet,
+    keep: Callable[[FocalEstimate], None],
+) -> tuple[TrackingSession | SelfCalibratingSession, Callable[[int], Camera]]:
+    """The session for a source, and the camera of each of its frames by index.
+
+    A guessed camera is estimated: of a film in a first pass, of which ``keep`` gets the result, else while it runs.
+    """
+    from arview.annotation import estimate_camera
+    from arview.tracking.self_calibration.session import SelfCalibratingSession
+
+    if not is_guessed:
+        return make_session(camera, None), lambda index: camera
+    following = SelfCalibratingSession(make_session, views, camera)
+    if frames.is_live:
+        return following, following.camera_of
+    with progress_bar("focal length") as progress:
+        estimate = estimate_camera(frames, following, lambda done: progress(done, frames.frame_count or 0))
+    keep(estimate)
+    final = estimate.camera if estimate.is_determined else camera
+    return make_session(final, None), lambda index: final
+
+
 def load_pose(path: str) -> Array:
     """``cam_from_model`` (4,4), mm, of a JSON file.
 
@@ -373,3 +403,48 @@ def refuse_for_several(options: dict[str, str | None]) -> None:
     for name, value in options.items():
         if value:
             raise InputError(f"{name} is for one part; leave it out, or give one --part without --instances")
+
+
+def check_profile(name: str | None, camera_spec: str | None) -> None:
+    """Check that an estimated camera can be kept under a name.
+
+    Raises:
+        InputError: a camera was given, so that nothing is estimated, or the name is no name of a profile.
+    """
+    from arview.camera.profiles import profile_path
+
+    if name is None:
+        return
+    if camera_spec is not None:
+        raise InputError("--save-profile keeps a camera that was estimated; leave out --camera to have it estimated")
+    profile_path(name)
+
+
+def report_estimate(estimate: FocalEstimate, profile: str | None, source: str, turns: int) -> None:
+    """Say what was estimated, and keep it as a profile if one was asked for.
+
+    Args:
+        estimate: the result.
+        profile: name of the profile; None: none was asked for.
+        source: video that it was estimated from.
+        turns: quarter turns clockwise applied to its frames.
+    """
+    from arview.tracking.self_calibration.profile import keep_profile
+
+    can_be_kept = estimate.is_determined and profile is None
+    say(estimate.text + ("; keep it with --save-profile NAME" if can_be_kept else ""))
+    if profile is None:
+        return
+    if not estimate.is_determined:
+        say(f"profile {profile} was not written")
+        return
+    path = keep_profile(estimate, profile, source, turns)
+    say(f"wrote {path}; use it with --camera profile:{profile}")
+
+
+def likely_cause(camera: Camera) -> str:
+    """What to try when a part was not found with a guessed camera."""
+    return (
+        f"a likely cause: the camera was guessed, with a focal length of {camera.fx:.0f} px and no distortion; "
+        "give --camera with a file, fov:DEG or exif"
+    )

@@ -16,9 +16,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from arview.cli.common import RENDERER, UNIT, main, output_path, progress_bar, refuse_for_several, say
+from arview.cli.common import RENDERER, UNIT, check_profile, main, output_path, progress_bar, refuse_for_several, say
 from arview.cli.exit_codes import ExitCode
-from arview.cli.guessed_camera import check_profile
 from arview.errors import InputError, MissingDependencyError
 
 if TYPE_CHECKING:

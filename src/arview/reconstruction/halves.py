@@ -45,11 +45,25 @@ def halves_of(folder: Path, sparse: SparseModel, options: HalvesOptions | None =
     options = options or HalvesOptions()
     if len(sparse.photos) < options.min_photos:
         raise CannotMeasureError(f"{len(sparse.photos)} photos are too few to be halved ({options.min_photos} needed)")
-    return tuple(_half(folder, sparse, sparse.photos[first::2], options.sparse) for first in (0, 1))
+    return tuple(adjusted_alone(folder, sparse, sparse.photos[first::2], options.sparse) for first in (0, 1))
 
 
-def _half(folder: Path, whole: SparseModel, photos: Sequence[PosedPhoto], options: SparseOptions) -> SparseModel:
-    """The model of some of the photos, adjusted alone."""
+def adjusted_alone(
+    folder: Path, whole: SparseModel, photos: Sequence[PosedPhoto], options: SparseOptions | None = None
+) -> SparseModel:
+    """The model of some of the photos, adjusted without the others, in frame and unit of the whole one.
+
+    Args:
+        folder: of the whole model in COLMAP's format, in any unit.
+        whole: the whole model.
+        photos: some of its photos.
+        options: of the adjustment.
+
+    Raises:
+        CannotMeasureError: they are not placed without the others.
+    """
+    options = options or SparseOptions()
+    named = f"{len(photos)} of the photos ({', '.join(photo.name for photo in photos[:2])}, …)"
     pycolmap = import_pycolmap()
     model = read_reconstruction(folder)
     names = {photo.name for photo in photos}
@@ -62,14 +76,12 @@ def _half(folder: Path, whole: SparseModel, photos: Sequence[PosedPhoto], option
     refines_centre = adjust_with_centre(model, options, threads)
     pycolmap.ObservationManager(model).filter_all_points3D(options.max_error_px, options.min_angle_deg)
     if len(model.points3D) < options.groups.min_shared_points:
-        raise CannotMeasureError(f"half of the photos ({photos[0].name}, {photos[1].name}, …) share too few points")
+        raise CannotMeasureError(f"{named} share too few points")
     adjuster = adjust(model, threads, refines_centre=refines_centre)
     sparse = sparse_model_of(model, listed)
     sparse = replace(sparse, pose_covariance=pose_covariance(sparse, model, adjuster))
     if len(linked_groups(sparse, options.groups)) > 1:
-        raise CannotMeasureError(
-            f"half of the photos ({photos[0].name}, {photos[1].name}, …) are not placed without the other half"
-        )
+        raise CannotMeasureError(f"{named} are not placed without the others")
     return _onto(sparse, whole)
 
 

@@ -1,0 +1,190 @@
+"""The command capture: a film or a station camera → the photos of a part that are worth measuring."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from arview.cli.common import (
+    RENDERER,
+    UNIT,
+    camera_for,
+    likely_cause,
+    load_pose,
+    main,
+    progress_bar,
+    report_estimate,
+    say,
+    start_session,
+)
+from arview.cli.exit_codes import ExitCode
+
+if TYPE_CHECKING:
+    from arview.cad import Part
+    from arview.camera import Camera
+    from arview.capture import CaptureAdvice
+    from arview.geometry import Array
+    from arview.guideviews import GuideViewSet
+    from arview.tracking import TrackingSession
+    from arview.workflow.walk.job import JobFolder
+
+SAID_EVERY_S = 3.0
+"""Time between two lines that say where to go, with a camera."""
+
+
+@main.command(
+    short_help="Choose the photos to measure from a film or camera.",
+    exit_codes={
+        ExitCode.DONE: "done; every component was seen well from enough directions",
+        ExitCode.UNDECIDED: "photos were taken, but more are wanted; what is lacking is printed",
+        ExitCode.CANNOT_MEASURE: "no photo was taken: the part was not tracked, or never from a good place",
+        ExitCode.INTERRUPTED: "interrupted; the photos taken so far are kept and can be used",
+    },
+    epilog="""\b
+Examples:
+  arview capture walk.mp4 --part part.toml --camera phone.json -o photos/
+  arview inspect --part part.toml --photos photos/ --camera photos/camera.json -o out/
+  arview capture 0 --part part.toml --camera station.json -o photos/ --serial PL-0417
+  arview capture rtsp://camera.local/1 --part part.toml --camera station.json -o photos/ --count 12
+  arview capture "frames/*.png" --fps 24 --part part.toml --camera phone.json -o photos/
+
+\b
+The part is tracked through SOURCE, and a frame becomes a photo when it is taken from a new direction that
+lowers the uncertainty U to be expected of the components, when the part is tracked well, is at a good
+distance and wholly in the picture, and when the frame is sharp. It ends when 20 photos (or --count) are
+taken and every component is seen in 4 of them from 3 directions with a U below a quarter of its tolerance;
+where a component lacks photos, up to 40 are taken. With a camera, it is printed where to go next. A part
+on a turntable, or a camera on an arm, works the same way: what counts is the pose of the part.
+
+\b
+FOLDER is new or empty and gets
+  photos/0001.jpg …  frames in full size; of a folder of pictures, the files themselves with their EXIF data
+  photos.jsonl       a line for each photo: name, SHA-256, time, tracked pose; the last line is the end
+  camera.json        the camera, where --camera was given: use it for `arview inspect --camera`
+  job.json           with --serial: the folder is then a job like those of the live page
+Each photo is complete on the disk before the next one is looked for.
+
+\b
+The direction of a photo is that of the camera as seen from the middle of the part, within the range of
+views of the part file. Expected U: k = 2, along the worst axis, for pixels of these frames.
+CAMERA is as in `arview annotate --help`; without it the focal length is estimated first.""",
+)
+@click.argument("source")
+@click.option("--part", "part_path", required=True, metavar="PART", help="Part file or CAD file.")
+@click.option("-o", "--output", required=True, metavar="FOLDER", help="New folder for the photos.")
+@click.option("--camera", "camera_spec", metavar="CAMERA", help="Camera of the frames; without it, it is guessed.")
+@click.option("--serial", metavar="SERIAL", help="Serial number of the specimen: makes FOLDER a job.")
+@click.option("--count", type=click.IntRange(3, 200), metavar="N", help="Photos wanted; default: 20.")
+@click.option("--init", metavar="POSE.json", help="Rough pose of the part in the first frame.")
+@click.option("--stride", type=click.IntRange(min=1), default=1, help="Take every N-th frame.", metavar="N")
+@click.option("--fps", type=float, default=30.0, show_default=True, help="Frame rate of a folder or glob of pictures.")
+@RENDERER
+@UNIT
+@click.pass_context
+def capture(
+    ctx: click.Context,
+    source: str,
+    part_path: str,
+    output: str,
+    camera_spec: str | None,
+    serial: str | None,
+    count: int | None,
+    init: str | None,
+    stride: int,
+    fps: float,
+    renderer: str,
+    unit: str | None,
+) -> None:
+    """Take the photos of a part that are worth measuring out of SOURCE: a film, pictures, a camera or an address."""
+    from arview.cad import load_part
+    from arview.camera.write import write_camera
+    from arview.guideviews import GuideViewOptions
+    from arview.guideviews.cache import cached_guide_views
+    from arview.video import open_source
+    from arview.workflow.capture import capture_options, capture_photos, open_folder, summary_lines
+
+    part = load_part(part_path, unit)
+    first_pose = load_pose(init) if init else None
+    with open_source(source, stride=stride, fps=fps) as frames:
+        camera = camera_for(frames, camera_spec, source)
+        folder = Path(output)
+        was_there = folder.exists()
+        job = open_folder(folder, part, serial, camera_spec)
+        try:
+            with progress_bar("guide views") as progress:
+                views = cached_guide_views(
+                    part.model, part.effective_view_range, GuideViewOptions(renderer=renderer), progress=progress
+                )
+            make = partial(_session, part, views, first_pose)
+            keep = partial(report_estimate, profile=None, source=source, turns=frames.quarter_turns_clockwise)
+            session, camera_of = start_session(make, frames, camera, camera_spec is None, views, keep)
+            with progress_bar("frames", frames.frame_count) as progress:
+                show = _Teller(frames.is_live)
+                summary = capture_photos(
+                    frames, session, part, camera_of, job, capture_options(count),
+                    lambda done, advice: (progress(done, frames.frame_count or 0), show(advice))[0],
+                )  # fmt: skip
+            if summary.photos and camera_spec is not None:
+                write_camera(camera, folder / "camera.json")
+        finally:
+            if not job.photos():
+                _remove(job, was_there)
+        for note in frames.notes:
+            say(f"note: {note}")
+    if summary.ended_reason:
+        say(f"warning: {summary.ended_reason}")
+    for line in summary_lines(summary, part):
+        click.echo(line)
+    if summary.photos:
+        click.echo(f"\nwrote {folder}: use it with arview inspect --photos {folder}")
+    elif camera_spec is None:
+        click.echo(likely_cause(camera))
+    if summary.is_interrupted:
+        say("interrupted")
+        ctx.exit(ExitCode.INTERRUPTED)
+    if not summary.photos:
+        ctx.exit(ExitCode.CANNOT_MEASURE)
+    is_enough = summary.advice is not None and summary.advice.is_enough
+    ctx.exit(ExitCode.DONE if is_enough else ExitCode.UNDECIDED)
+
+
+def _session(
+    part: Part, views: GuideViewSet, first_pose: Array | None, camera: Camera, start: Array | None
+) -> TrackingSession:
+    """A session that starts at a rough pose (4,4), or searches."""
+    from arview.tracking import TrackingSession
+
+    return TrackingSession(
+        views, camera=camera, model=part.model, initial_cam_from_model=first_pose if start is None else start
+    )
+
+
+def _remove(job: JobFolder, was_there: bool) -> None:
+    """Remove the folder of a capture without photos, or what was put into it."""
+    if not was_there:
+        shutil.rmtree(job.path, ignore_errors=True)
+        return
+    for path in [*(job.path / "photos").glob("*"), job.path / "job.json", job.path / ".photos.lock"]:
+        path.unlink(missing_ok=True)
+    (job.path / "photos").rmdir()
+
+
+class _Teller:
+    """Says where to go next on stderr, for a camera; a film cannot be told."""
+
+    def __init__(self, is_live: bool) -> None:
+        self._is_live = is_live
+        self._said = ""
+        self._said_s = -SAID_EVERY_S
+
+    def __call__(self, advice: CaptureAdvice) -> None:
+        text = "; ".join(one for one in (f"{advice.photos} taken", advice.text, advice.reason) if one)
+        now_s = time.monotonic()
+        if self._is_live and text != self._said and now_s - self._said_s >= SAID_EVERY_S:
+            self._said, self._said_s = text, now_s
+            say(text)
