@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from arview.cad import Part
     from arview.camera import Camera
     from arview.capture import CaptureAdvice
+    from arview.core.progress import StepProgress
     from arview.geometry import Array
     from arview.guideviews import GuideViewSet
     from arview.tracking import TrackingSession
@@ -124,11 +125,8 @@ def capture(
             keep = partial(report_estimate, profile=None, source=source, turns=frames.quarter_turns_clockwise)
             session, camera_of = start_session(make, frames, camera, camera_spec is None, views, keep)
             with progress_bar("frames", frames.frame_count) as progress:
-                show = _Teller(frames.is_live)
-                summary = capture_photos(
-                    frames, session, part, camera_of, job, capture_options(count),
-                    lambda done, advice: (progress(done, frames.frame_count or 0), show(advice))[0],
-                )  # fmt: skip
+                show = _Teller(frames.is_live, frames.frame_count or 0, progress)
+                summary = capture_photos(frames, session, part, camera_of, job, capture_options(count), show)
             if summary.photos and camera_spec is not None:
                 write_camera(camera, folder / "camera.json")
         finally:
@@ -175,14 +173,15 @@ def _remove(job: JobFolder, was_there: bool) -> None:
 
 
 class _Teller:
-    """Says where to go next on stderr, for a camera; a film cannot be told."""
+    """Moves the bar, and says where to go next on stderr, for a camera; a film cannot be told."""
 
-    def __init__(self, is_live: bool) -> None:
-        self._is_live = is_live
+    def __init__(self, is_live: bool, frames: int, progress: StepProgress) -> None:
+        self._is_live, self._frames, self._progress = is_live, frames, progress
         self._said = ""
         self._said_s = -SAID_EVERY_S
 
-    def __call__(self, advice: CaptureAdvice) -> None:
+    def __call__(self, done: int, advice: CaptureAdvice) -> None:
+        self._progress(done, self._frames)
         text = "; ".join(one for one in (f"{advice.photos} taken", advice.text, advice.reason) if one)
         now_s = time.monotonic()
         if self._is_live and text != self._said and now_s - self._said_s >= SAID_EVERY_S:
