@@ -169,7 +169,7 @@ def test_a_folder_that_holds_something_is_refused(tmp_path: Path) -> None:
     (tmp_path / "note.txt").write_text("mine")
     with pytest.raises(OutputError, match="not empty"):
         open_folder(tmp_path, PART, None, None)
-    with pytest.raises(OutputError, match="note.txt"):
+    with pytest.raises(OutputError, match=r"note\.txt"):
         open_folder(tmp_path / "note.txt", PART, None, None)
 
 
