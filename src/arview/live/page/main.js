@@ -407,11 +407,12 @@ mountJob(host);
 
 // --- start and end ------------------------------------------------------------------------------
 
-const measure = new ResizeObserver(() => {
+// In the next frame: what the observed elements do with it must not be part of this observation.
+const measure = new ResizeObserver(() => requestAnimationFrame(() => {
   const { style: root } = document.documentElement, top = (id) => find(id).getBoundingClientRect().top || innerHeight;
   root.setProperty("--bar", `${find("bar").offsetHeight}px`);
   root.setProperty("--below", `${innerHeight - Math.min(top("actions"), top("card"))}px`);
-});
+}));
 for (const id of ["bar", "actions", "card"]) measure.observe(find(id));
 
 let wakeLock = null;

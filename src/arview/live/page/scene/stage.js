@@ -56,8 +56,16 @@ export class Stage {
       },
       onDouble: () => before && this.onPick(...before), // the first of two taps was no choice
     });
-    new ResizeObserver(() => this.measure()).observe(this.stage);
-    for (const one of [...this.obstacles, this.controls]) new ResizeObserver(() => this.measure()).observe(one);
+    let isAsked = false;
+    const observer = new ResizeObserver(() => {
+      if (isAsked) return;
+      isAsked = true;
+      requestAnimationFrame(() => { // not at once: measuring may change the size of what is observed
+        isAsked = false;
+        this.measure();
+      });
+    });
+    for (const one of [this.stage, ...this.obstacles, this.controls]) observer.observe(one);
     document.fonts?.ready.then(() => this.labelBoxes.remeasure());
   }
 

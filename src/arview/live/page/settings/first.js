@@ -1,4 +1,9 @@
-// Applies the chosen colours and text size before the page is drawn for the first time; not a module, so that it can.
+// Applies the chosen colours and text size before the page is drawn for the first time; not a module, so that it can. It also
+// keeps the errors of the page's own scripts, for whoever looks for a fault.
+
+globalThis.arviewErrors = [];
+addEventListener("error", (event) => globalThis.arviewErrors.push(String(event.error?.stack ?? event.message)));
+addEventListener("unhandledrejection", (event) => globalThis.arviewErrors.push(String(event.reason?.stack ?? event.reason)));
 
 globalThis.arviewLook = (() => {
   const KEY = "arview-look", SCALES = { normal: 1, large: 1.2, largest: 1.45 };
