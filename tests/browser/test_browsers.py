@@ -1,4 +1,4 @@
-"""The live page in Chromium, Firefox and WebKitGTK on the screens of phones: it draws, and every control can be used."""
+"""The live page in Chromium, Firefox and WebKitGTK on phone screens: it draws, and every control can be used."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ return shown.map((one) => {
 """
 IN_SHEET = """
 const side = document.querySelector('#side'), box = side.getBoundingClientRect();
-const kinds = ['section.is-open button', 'section.is-open input', 'section.is-open label', '#tabs button', '#close-side'];
-const shown = [...side.querySelectorAll(kinds.join())];
+const own = ['button', 'input', 'label'].map((one) => `section.is-open ${one}`);
+const shown = [...side.querySelectorAll([...own, '#tabs button', '#close-side'].join())];
 return {
   left: box.left, right: box.right, overflow: side.scrollWidth - side.clientWidth,
   outside: shown.filter((one) => one.getClientRects().length)
