@@ -62,7 +62,9 @@ class Bench:
             raise self.fails[what]
         self.did.append(what)
 
-    def reconstruct(self, source: str, folder: Path, part: Any, camera: Any, options: Any, progress: Any) -> Any:
+    def reconstruct(
+        self, source: str, folder: Path, part: Any, camera: Any, options: Any, progress: Any, memory: Any = None
+    ) -> Any:
         stages = Stages(folder)
         key = content_key(sorted(Path(source).iterdir()) if Path(source).is_dir() else [Path(source)])
         seconds = {"photos": 0.1}

@@ -72,6 +72,8 @@ A video or PDF that cannot be made is a warning: the verdict stands without it."
 @click.option("--masks", metavar="FOLDER", help="Masks as IMAGE.png, black where a photo is not to be used.")
 @click.option("--sparse", metavar="FOLDER|FILE",
               help="Camera poses made elsewhere: COLMAP model, Metashape XML or transforms.json.")  # fmt: skip
+@click.option("--pairs", metavar="FILE",
+              help="Match only the pairs of photos that another run matched: its sparse/pairs.json.")  # fmt: skip
 @click.option("--tolerance", type=click.FloatRange(min=0, min_open=True), metavar="MM",
               help="Tolerance of components that have none in the part file.")  # fmt: skip
 @click.option("--guard", type=click.FloatRange(0, 3), default=1.0, show_default=True, metavar="G",
@@ -102,6 +104,7 @@ def inspect(
     scale_file: str | None,
     masks: str | None,
     sparse: str | None,
+    pairs: str | None,
     tolerance: float | None,
     guard: float,
     max_frames: int,
@@ -119,7 +122,7 @@ def inspect(
 
     job = InspectJob(
         part_path, photos, video, serial, camera, video_camera, scale_file, unit, masks, sparse, tolerance,
-        guard, max_frames, seed, threads, device, not no_pdf, not no_repeatability,
+        guard, max_frames, seed, threads, device, not no_pdf, not no_repeatability, pairs,
     )  # fmt: skip
     if store is not None:
         from arview.history import HistoryStore

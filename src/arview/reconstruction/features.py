@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -12,8 +13,6 @@ from numpy.typing import NDArray
 
 from arview.core.progress import StepProgress
 from arview.reconstruction.gpu.sift import KeyPoints, sift
-from arview.reconstruction.intake import read_photo
-from arview.reconstruction.intake.masks import read_mask
 from arview.reconstruction.types import Photo
 
 Descriptors = NDArray[np.float32]
@@ -47,10 +46,32 @@ class Features:
     def __len__(self) -> int:
         return len(self.points_px)
 
+    def taken(self, which: NDArray[Any]) -> Features:
+        """Some of the features, by indices or a mask."""
+        return Features(
+            self.points_px[which], np.ascontiguousarray(self.descriptors[which]), self.sizes_px[which],
+            self.colors[which],
+        )  # fmt: skip
+
 
 _NONE = Features(
     np.zeros((0, 2), np.float32), np.zeros((0, 128), np.float32), np.zeros(0, np.float32), np.zeros((0, 3), np.uint8)
 )
+
+
+@dataclass(frozen=True)
+class DetectedFeatures:
+    """Features of one photo as SIFT detects them.
+
+    Attributes:
+        points_px, sizes_px, colors: see `Features`.
+        sums: (N,128) float32 sums of gradients, SIFT's own descriptor; whole numbers from 0 to 255 in OpenCV.
+    """
+
+    points_px: NDArray[np.float32]
+    sums: NDArray[np.float32]
+    sizes_px: NDArray[np.float32]
+    colors: NDArray[np.uint8]
 
 
 def find_features(
@@ -59,11 +80,20 @@ def find_features(
     mask: NDArray[np.bool_] | None = None,
     device: str | None = None,
 ) -> Features:
-    """SIFT features of an (H,W,3) RGB picture, spread over it, where the ``mask`` (H,W) is True.
+    """SIFT features of an (H,W,3) RGB picture, spread over it, where the ``mask`` (H,W) is True."""
+    return features_of(detect_features(image, options or FeatureOptions(), mask, device))
+
+
+def detect_features(
+    image: NDArray[np.uint8],
+    options: FeatureOptions,
+    mask: NDArray[np.bool_] | None = None,
+    device: str | None = None,
+) -> DetectedFeatures:
+    """What SIFT detects in an (H,W,3) RGB picture, see `find_features`.
 
     They are found by OpenCV, or on a torch ``device``; both find the same but for rounding.
     """
-    options = options or FeatureOptions()
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     height, width = grey.shape
     reduction = max(1.0, max(height, width) / options.max_side_px)
@@ -78,15 +108,13 @@ def find_features(
     else:
         points, sizes, strength, sums = sift(grey, options.max_features, options.contrast_threshold, allowed, device)
     if len(points) == 0:
-        return _NONE
+        return DetectedFeatures(_NONE.points_px, _NONE.descriptors, _NONE.sizes_px, _NONE.colors)
     order = _spread(points, strength, grey.shape)[: options.max_features]
-    roots = np.sqrt(sums / np.maximum(sums.sum(axis=1, keepdims=True), 1e-9))
-    roots /= np.maximum(np.linalg.norm(roots, axis=1, keepdims=True), 1e-9)
     points_px = (points[order] + 0.5) * scale - 0.5
     columns, rows = np.clip(np.rint(points_px), 0, (width - 1, height - 1)).astype(int).T
-    return Features(
+    return DetectedFeatures(
         points_px=points_px,
-        descriptors=np.ascontiguousarray(roots[order], dtype=np.float32),
+        sums=np.asarray(sums[order], dtype=np.float32),
         sizes_px=sizes[order] * scale.mean(),
         colors=image[rows, columns],
     )
@@ -108,6 +136,13 @@ def _opencv_sift(grey: NDArray[np.uint8], options: FeatureOptions, allowed: NDAr
     return KeyPoints(points, sizes, np.array([key.response for key in keys]), sums)
 
 
+def features_of(found: DetectedFeatures) -> Features:
+    """The features with RootSIFT descriptors."""
+    roots = np.sqrt(found.sums / np.maximum(found.sums.sum(axis=1, keepdims=True), 1e-9))
+    roots /= np.maximum(np.linalg.norm(roots, axis=1, keepdims=True), 1e-9)
+    return Features(found.points_px, np.ascontiguousarray(roots, dtype=np.float32), found.sizes_px, found.colors)
+
+
 def _spread(points: NDArray[np.float32], strength: NDArray[np.float64], shape: tuple[int, ...]) -> NDArray[np.intp]:
     """Order in which, for any n, the first n features are strong and spread over an 8×8 grid of the picture."""
     cells = np.minimum((points / (shape[1], shape[0]) * 8).astype(int), 7)
@@ -120,24 +155,22 @@ def _spread(points: NDArray[np.float32], strength: NDArray[np.float64], shape: t
 
 
 def find_all_features(
-    photos: Sequence[Photo],
-    options: FeatureOptions,
-    threads: int,
-    progress: StepProgress | None = None,
-    device: str | None = None,
+    photos: Sequence[Photo], find: Callable[[Photo], Features], threads: int, progress: StepProgress | None = None
 ) -> list[Features]:
     """Features of every photo, in their order, outside of what its mask leaves out; ``threads`` photos at a time.
 
-    On a torch ``device`` two at a time, so that one is read while the other is worked on.
+    Args:
+        photos: the photos.
+        find: gives the features of one photo.
+        threads: photos at a time.
+        progress: called with the number of photos done and in all.
 
     Raises:
         InputError: a photo cannot be read.
     """
     found: list[Features] = []
-    with ThreadPoolExecutor(threads if device is None else 2) as pool:
-        for features in pool.map(
-            lambda photo: find_features(read_photo(photo.path), options, read_mask(photo), device), photos
-        ):
+    with ThreadPoolExecutor(threads) as pool:
+        for features in pool.map(find, photos):
             found.append(features)
             if progress:
                 progress(len(found), len(photos))

@@ -164,9 +164,12 @@ def match_along_lines(
         one, other = (Side(side.descriptors, side.sizes_px, ray) for side, ray in zip(features, rays, strict=True))
         return match_on_lines((one, other), focal_px, essential, band_px, _LIMITS, device)
     there = _along_one_way(rays, focal_px, features, essential, band_px)
-    back = _along_one_way(rays[::-1], focal_px, features[::-1], essential.T.copy(), band_px)
     rows = np.flatnonzero(there >= 0)
-    mutual = rows[back[there[rows]] == rows]
+    # Only features that are somebody's partner are matched back.
+    wanted, place = np.unique(there[rows], return_inverse=True)
+    others = features[1].taken(wanted)
+    back = _along_one_way((rays[1][wanted], rays[0]), focal_px, (others, features[0]), essential.T.copy(), band_px)
+    mutual = rows[back[place] == rows]
     return np.stack([mutual, there[mutual]], axis=1).astype(np.uint32)
 
 

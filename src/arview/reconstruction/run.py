@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import json
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import NoneType
@@ -46,6 +47,8 @@ from arview.reconstruction.intake import (
 )
 from arview.reconstruction.intake.masks import with_masks
 from arview.reconstruction.intake.sensor import share_lenses
+from arview.reconstruction.memory import SparseMemory
+from arview.reconstruction.pairs import KnownPairs
 from arview.reconstruction.quality import Quality, quality_of
 from arview.reconstruction.scale import CadOptions, ScaleResult, ScaleSources, find_scale
 from arview.reconstruction.sparse import SparseOptions, reconstruct_from_poses, reconstruct_sparse
@@ -78,6 +81,9 @@ class ReconstructOptions:
     dense: DenseOptions = field(default_factory=DenseOptions)
     poses: Path | None = None  # camera poses made elsewhere, see `given_poses`; None: structure from motion
     masks: Path | None = None  # folder with a mask for each photo, black where it is not to be used
+    known: KnownPairs = field(
+        default_factory=KnownPairs
+    )  # pairs of photos to be matched, or rough poses to choose them
     last_stage: StageName = "dense"
     starts_over: bool = False  # discard what an earlier run left in the folder
 
@@ -113,36 +119,38 @@ class Reconstruction:
 
 
 def reconstruct(
-    source: str | Path,
+    source: str | Path | Sequence[str | Path],
     folder: str | Path,
     part: Part | None = None,
     camera: str | None = None,
     options: ReconstructOptions | None = None,
     *,
     progress: Progress | None = None,
+    memory: SparseMemory | None = None,
 ) -> Reconstruction:
     """Reconstruct what the photos show.
 
     Stages that an earlier run finished in ``folder`` with the same photos and options are read, not repeated.
 
     Args:
-        source: folder or glob of photos, or a video file.
+        source: folder, glob or list of photos, or a video file.
         folder: where everything is written; made when missing.
         part: gives the scale and the frame, the region of the dense cloud and the coverage.
         camera: camera file or ``fov:DEG``; without it, EXIF data or a guess, refined with the poses.
         options: of the stages.
         progress: called with (what, done, total).
+        memory: features and matches that were found before.
 
     Raises:
         InputError: too few or unusable photos, or photos that do not fit together; the message says what to do.
         MismatchError: the camera does not fit the photos.
         OutputError: the folder cannot be written to.
     """
-    check_type(source, PATH, "reconstruct: source")
+    check_type(source, (*PATH, list, tuple), "reconstruct: source")
     check_type(folder, PATH, "reconstruct: folder")
     check_type(part, (Part, NoneType), "reconstruct: part")
     run = _ReconstructionRun(
-        Path(folder), part, options or ReconstructOptions(), progress or (lambda what, done, total: None)
+        Path(folder), part, options or ReconstructOptions(), progress or (lambda what, done, total: None), memory
     )
     return run.all(source, camera)
 
@@ -150,15 +158,18 @@ def reconstruct(
 class _ReconstructionRun:
     """One run, with its folder and options and the time of its stages."""
 
-    def __init__(self, folder: Path, part: Part | None, options: ReconstructOptions, tell: Progress) -> None:
-        self.folder, self.part, self.options, self.tell = folder, part, options, tell
+    def __init__(
+        self, folder: Path, part: Part | None, options: ReconstructOptions, tell: Progress,
+        memory: SparseMemory | None = None,
+    ) -> None:  # fmt: skip
+        self.folder, self.part, self.options, self.tell, self.memory = folder, part, options, tell, memory
         self.stages = Stages(folder)
         self.seconds: dict[str, float] = {}
         if options.starts_over:
             self.stages.restart("frames")
             self._restart("photos")
 
-    def all(self, source: str | Path, camera: str | None) -> Reconstruction:
+    def all(self, source: str | Path | Sequence[str | Path], camera: str | None) -> Reconstruction:
         """Run the stages in their order."""
         intake = self._photos(source, camera)
         sparse, scale, cloud, cover = None, None, None, None
@@ -167,6 +178,7 @@ class _ReconstructionRun:
             key = key_of([replace(photo, path=Path(), mask=None) for photo in intake.photos], self.options.sparse)
             masks = [photo.mask for photo in intake.photos if photo.mask is not None]
             key = key_of(key, content_key(photo.path for photo in intake.photos), content_key(masks))
+            key = key_of(key, self.options.known.key())
             if self.options.poses is not None:
                 key = key_of(key, [(one.name, one.cam_from_scan.tolist()) for one in read_poses(self.options.poses)])
             sparse = self._sparse(intake.photos, key)
@@ -198,9 +210,9 @@ class _ReconstructionRun:
     def _record_time(self, name: str, began: float) -> None:
         self.seconds[name] = round(time.perf_counter() - began, 2)
 
-    def _photos(self, source: str | Path, camera: str | None) -> Intake:
+    def _photos(self, source: str | Path | Sequence[str | Path], camera: str | None) -> Intake:
         began = time.perf_counter()
-        if Path(source).suffix.lower() in VIDEO_SUFFIXES and Path(source).is_file():
+        if isinstance(source, str | Path) and Path(source).suffix.lower() in VIDEO_SUFFIXES and Path(source).is_file():
             intake = self._frames(Path(source), camera)
         else:
             intake = intake_photos(source, camera, progress=lambda i, n: self.tell("photos", i, n))
@@ -240,7 +252,7 @@ class _ReconstructionRun:
     def _placed(self, photos: tuple[Photo, ...], folder: Path) -> SparseModel:
         """The photos placed by structure from motion, or by the poses that were given."""
         if self.options.poses is None:
-            return reconstruct_sparse(photos, folder, self.options.sparse, self.tell)
+            return reconstruct_sparse(photos, folder, self.options.sparse, self.tell, self.options.known, self.memory)
         posed, left_out = photos_with_poses(photos, read_poses(self.options.poses), self.options.poses)
         sparse = reconstruct_from_poses(posed, folder, self.options.sparse, self.tell)
         return replace(sparse, unplaced=(*sparse.unplaced, *left_out))

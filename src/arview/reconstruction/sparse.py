@@ -36,11 +36,19 @@ from arview.reconstruction.features import FeatureOptions, Features, find_all_fe
 from arview.reconstruction.gpu.device import torch_device
 from arview.reconstruction.groups import GroupOptions, linked_groups
 from arview.reconstruction.matching import Matches, epipolar_inliers, match_along_lines, match_descriptors
+from arview.reconstruction.memory import SparseMemory, feature_prints
+from arview.reconstruction.pairs import (
+    KnownPairs,
+    Pair,
+    PairOptions,
+    chosen_pairs,
+    doubtful_pairs,
+    pairs_in_common_view,
+    write_pairs,
+)
 from arview.reconstruction.still import StillOptions, moved_matches, still_features, still_remark, without
 from arview.reconstruction.types import Photo, SparseModel
 from arview.reconstruction.unplaced import unplaced_photos, why_nothing
-
-Pair = tuple[int, int]
 
 
 @dataclass(frozen=True)
@@ -49,10 +57,7 @@ class SparseOptions:
 
     features: FeatureOptions = field(default_factory=FeatureOptions)
     first_features: int = 2500  # per photo in the first pass; matching by appearance grows with the square
-    preview_features: int = 400  # per photo, to choose the pairs to match; Wu 2013
-    preview_matches: int = 5  # of these that a chosen pair needs; chance gives 0 to 3
-    all_pairs_up_to: int = 12  # photos; up to this number every pair is matched
-    neighbours: int = 3  # following photos that are always matched: a walk around the part, a video
+    pairs: PairOptions = field(default_factory=PairOptions)
     max_epipolar_px: float = 4.0  # in the first pass, before the distortion is known
     band_px: float = 2.0  # half width of the band around epipolar lines in the second pass
     min_matches: int = 15  # pairs with fewer matches are due to chance
@@ -68,9 +73,18 @@ class SparseOptions:
 
 
 def reconstruct_sparse(
-    photos: Sequence[Photo], folder: Path, options: SparseOptions | None = None, progress: Progress | None = None
-) -> SparseModel:
+    photos: Sequence[Photo], folder: Path, options: SparseOptions | None = None, progress: Progress | None = None,
+    known: KnownPairs | None = None, memory: SparseMemory | None = None,
+) -> SparseModel:  # fmt: skip
     """Reconstruct poses and points of the photos; COLMAP's database and model are left in ``folder``.
+
+    Args:
+        photos: the photos.
+        folder: where everything is left; ``pairs.json`` lists the pairs that were matched.
+        options: see `SparseOptions`.
+        progress: called with (what, done, total).
+        known: pairs to be matched, or rough poses by which they are chosen.
+        memory: features and matches that were found before, and those of this run.
 
     Raises:
         InputError: fewer than three photos can be placed together; the message gives the likely reason.
@@ -79,9 +93,11 @@ def reconstruct_sparse(
     tell = progress or (lambda stage, done, total: None)
     threads = options.threads or os.cpu_count() or 1
     folder.mkdir(parents=True, exist_ok=True)
-    features, remarks = _moving_features(photos, options, threads, tell)
+    known, memory = known or KnownPairs(), memory or SparseMemory()
+    features, remarks = moving_features(photos, options, threads, tell, memory)
     min_move_px = options.still.max_shift_px if remarks else 0.0
-    pairs = _match_by_appearance(features, options, threads, tell, min_move_px)
+    tried, pairs = match_by_appearance(photos, features, options, threads, tell, min_move_px, known, memory)
+    write_pairs(folder / "pairs.json", photos, tried)
     database_path = folder / "database.db"
     _write_database(database_path, photos, features, pairs, options)
     models = _map(database_path, folder, options, len(photos), tell)
@@ -121,7 +137,7 @@ def reconstruct_from_poses(
     threads = options.threads or os.cpu_count() or 1
     folder.mkdir(parents=True, exist_ok=True)
     photos = [photo for photo, _ in posed]
-    features, remarks = _moving_features(photos, options, threads, tell)
+    features, remarks = moving_features(photos, options, threads, tell, SparseMemory())
     database_path = folder / "database.db"
     _write_database(database_path, photos, features, {}, options)
     model = model_of_poses(posed)
@@ -156,65 +172,62 @@ def _finished(
     return sparse, _all_groups(sparse, split, models)
 
 
-def _moving_features(
-    photos: Sequence[Photo], options: SparseOptions, threads: int, tell: Progress
+def moving_features(
+    photos: Sequence[Photo], options: SparseOptions, threads: int, tell: Progress, memory: SparseMemory
 ) -> tuple[list[Features], list[str]]:
     """Features of all photos without those that stand still in the picture, and what is said of these."""
+    device = torch_device(options.device)
     features = find_all_features(
-        photos, options.features, threads, lambda i, n: tell("features", i, n), torch_device(options.device)
+        photos,
+        lambda photo: memory.features(photo, options.features, device),
+        threads if device is None else 2,
+        lambda i, n: tell("features", i, n),
     )
     still = still_features(features, options.still, threads)
     remark = still_remark(features, still, options.still)
-    kept = [without(one, dropped) for one, dropped in zip(features, still, strict=True)]
-    return kept, [remark] if remark else []
+    return [without(one, dropped) for one, dropped in zip(features, still, strict=True)], [remark] if remark else []
 
 
 # --- first pass ------------------------------------------------------------------------------------------
 
 
-def _match_by_appearance(
-    features: Sequence[Features], options: SparseOptions, threads: int, tell: Progress, min_move_px: float = 0.0
-) -> dict[Pair, Matches]:
-    """Matches of every pair of photos that has enough of them near epipolar lines.
+def match_by_appearance(
+    photos: Sequence[Photo], features: Sequence[Features], options: SparseOptions, threads: int, tell: Progress,
+    min_move_px: float, known: KnownPairs, memory: SparseMemory,
+) -> tuple[list[Pair], dict[Pair, Matches]]:  # fmt: skip
+    """The pairs that were matched, and the matches of those that have enough of them near epipolar lines.
 
     Before a still background, matches that move by less than ``min_move_px`` are left out.
     """
-    device = torch_device(options.device)
+    device, prints = torch_device(options.device), feature_prints(features)
 
     def match(pair: Pair) -> Matches:
         one, other = (features[index] for index in pair)
         count = options.first_features
-        matches = match_descriptors(one.descriptors[:count], other.descriptors[:count], device)
-        matches = moved_matches(one, other, matches, min_move_px)
-        return epipolar_inliers(one, other, matches, options.max_epipolar_px)
+
+        def find() -> Matches:
+            matches = match_descriptors(one.descriptors[:count], other.descriptors[:count], device)
+            matches = moved_matches(one, other, matches, min_move_px)
+            return epipolar_inliers(one, other, matches, options.max_epipolar_px)
+
+        key = (prints[pair[0]], prints[pair[1]], count, options.max_epipolar_px, min_move_px, device)
+        return memory.matches(key, find)
 
     found: dict[Pair, Matches] = {}
-    # One BLAS thread for each product of descriptors, because the products already run in parallel.
-    with ThreadPoolExecutor(threads) as pool, threadpool_limits(1, "blas"):
-        chosen = _promising_pairs(features, options, pool)
-        for done, (pair, matches) in enumerate(zip(chosen, pool.map(match, chosen), strict=True)):
+    tried: list[Pair] = []
+
+    def match_all(pairs: list[Pair]) -> None:
+        for done, (pair, matches) in enumerate(zip(pairs, pool.map(match, pairs), strict=True)):
             if len(matches) >= options.min_matches:
                 found[pair] = matches
-            tell("matching", done + 1, len(chosen))
-    return found
+            tell("matching", done + 1, len(pairs))
+        tried.extend(pairs)
 
-
-def _promising_pairs(features: Sequence[Features], options: SparseOptions, pool: ThreadPoolExecutor) -> list[Pair]:
-    """Pairs of photos whose largest features match often enough (preemptive matching, Wu 2013)."""
-    pairs = list(itertools.combinations(range(len(features)), 2))
-    if len(features) <= options.all_pairs_up_to:
-        return pairs
-    largest = [
-        np.ascontiguousarray(one.descriptors[np.argsort(-one.sizes_px, kind="stable")[: options.preview_features]])
-        for one in features
-    ]
-
-    def is_promising(pair: Pair) -> bool:
-        if pair[1] - pair[0] <= options.neighbours:
-            return True
-        return len(match_descriptors(largest[pair[0]], largest[pair[1]])) >= options.preview_matches
-
-    return [pair for pair, is_chosen in zip(pairs, pool.map(is_promising, pairs), strict=True) if is_chosen]
+    # One BLAS thread for each product of descriptors, because the products already run in parallel.
+    with ThreadPoolExecutor(threads) as pool, threadpool_limits(1, "blas"):
+        match_all(chosen_pairs(photos, features, options.pairs, known, pool))
+        match_all(doubtful_pairs(photos, features, options.pairs, known, tried, list(found), pool))
+    return sorted(tried), {pair: found[pair] for pair in sorted(found)}
 
 
 def _write_database(
@@ -324,7 +337,7 @@ def _match_along_lines(
         matches = match_along_lines((rays[i], rays[j]), focal, pair_of, essential, options.band_px, device)
         return moved_matches(*pair_of, matches, min_move_px)
 
-    chosen = _pairs_in_common_view(model, poses)
+    chosen = pairs_in_common_view(poses)
     found: dict[Pair, Matches] = {}
     with ThreadPoolExecutor(threads) as pool:
         for done, (pair, matches) in enumerate(zip(chosen, pool.map(match, chosen), strict=True)):
@@ -339,16 +352,6 @@ def _cameras_and_poses(model: Any, photos: Sequence[Photo]) -> tuple[dict[int, C
     place = {photo.name: index for index, photo in enumerate(photos)}
     cameras = {place[photo.name]: photo.camera for photo in sparse.photos}
     return cameras, {place[photo.name]: photo.cam_from_scan for photo in sparse.photos}
-
-
-MAX_PAIR_ANGLE_DEG = 45.0
-"""Largest angle between the viewing directions of a pair; beyond it SIFT finds nothing in common."""
-
-
-def _pairs_in_common_view(model: Any, poses: dict[int, Array]) -> list[Pair]:
-    """Pairs of placed photos that look in similar enough directions."""
-    limit = np.cos(np.radians(MAX_PAIR_ANGLE_DEG))
-    return [(i, j) for i, j in itertools.combinations(sorted(poses), 2) if poses[i][2, :3] @ poses[j][2, :3] > limit]
 
 
 def _write_matches(path: Path, pairs: dict[Pair, Matches]) -> None:

@@ -54,11 +54,7 @@ def still_features(
 
 def without(features: Features, dropped: NDArray[np.bool_]) -> Features:
     """The features that are not dropped, in their order."""
-    keep = ~dropped
-    return Features(
-        features.points_px[keep], np.ascontiguousarray(features.descriptors[keep]), features.sizes_px[keep],
-        features.colors[keep],
-    )  # fmt: skip
+    return features.taken(~dropped)
 
 
 def still_remark(

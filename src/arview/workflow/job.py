@@ -38,6 +38,7 @@ class InspectJob:
     device: str = "auto"  # device of features, matching and the dense cloud
     makes_pdf: bool = True
     compares_halves: bool = True  # measure two halves of the photos apart and compare them
+    pairs: str | None = None  # the sparse/pairs.json of another run, whose pairs of photos are matched
 
     @property
     def photo_source(self) -> str:

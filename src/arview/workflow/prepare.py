@@ -15,6 +15,7 @@ from arview.reconstruction.dense import DenseOptions
 from arview.reconstruction.given_poses import read_poses
 from arview.reconstruction.intake import VideoIntakeOptions
 from arview.reconstruction.intake.reading import photo_paths
+from arview.reconstruction.pairs import KnownPairs, read_pairs
 from arview.reconstruction.run import ReconstructOptions
 from arview.reconstruction.scale import ScaleSources, load_scale_file
 from arview.reconstruction.sparse import SparseOptions
@@ -70,6 +71,7 @@ def prepare(job: InspectJob, folder: Path) -> Prepared:
         dense=DenseOptions(seed=seed, threads=threads, device=job.device),
         poses=Path(job.sparse) if job.sparse else None,
         masks=Path(job.masks) if job.masks else None,
+        known=read_pairs(job.pairs) if job.pairs else KnownPairs(),
     )
     measure = MeasureOptions(
         tolerance_mm=job.tolerance_mm, maps_folder=folder / "inspection_distances", decision=DecisionOptions(job.guard)

@@ -24,6 +24,7 @@ from arview.core.stage_cache import Stages, content_key, key_of
 from arview.errors import CannotMeasureError, InputError, MismatchError, MissingDependencyError
 from arview.inspection import Inspection, Verdict, load_inspection, save_inspection
 from arview.inspection.summary import overall_verdict, verdict_sentence
+from arview.reconstruction.memory import SparseMemory
 from arview.reconstruction.run import Reconstruction, reconstruct
 from arview.version import __version__
 from arview.workflow.film import camera_of_video, make_film
@@ -107,22 +108,44 @@ def inspect_part(
     """
     check_type(job, InspectJob, "inspect_part: job")
     check_type(folder, PATH, "inspect_part: folder")
-    folder = Path(folder)
-    prepared = prepare(job, folder)
+    return inspect_prepared(prepare(job, Path(folder)), Path(folder), progress=progress, starts_over=starts_over)
+
+
+def inspect_prepared(
+    prepared: Prepared, folder: Path, *, progress: Progress | None = None, starts_over: bool = False,
+    memory: SparseMemory | None = None, on_verdict: Callable[[Inspection], None] | None = None,
+) -> Outcome:  # fmt: skip
+    """Inspect one part as `inspect_part` does, from inputs that are read and checked.
+
+    Args:
+        prepared: the inputs.
+        folder: folder of all results.
+        progress: see `inspect_part`.
+        starts_over: see `inspect_part`.
+        memory: features and matches that were found while the photos came.
+        on_verdict: called with the measurement in the photos, which is then made and written before the dense cloud;
+            the cloud and the comparison of halves may still add to it.
+
+    Raises:
+        the same as `inspect_part`.
+    """
     with exclusive_access(folder, ".lock", waits=False):
-        return _InspectionRun(prepared, folder, progress or (lambda what, done, total: None)).execute(starts_over)
+        run = _InspectionRun(prepared, folder, progress or (lambda what, done, total: None), memory)
+        return run.execute(starts_over, on_verdict)
 
 
 class _InspectionRun:
     """One run: its inputs, and the stages and warnings so far."""
 
-    def __init__(self, prepared: Prepared, folder: Path, progress: Progress) -> None:
-        self.prepared, self.folder, self.progress = prepared, folder, progress
+    def __init__(
+        self, prepared: Prepared, folder: Path, progress: Progress, memory: SparseMemory | None = None
+    ) -> None:
+        self.prepared, self.folder, self.progress, self.memory = prepared, folder, progress, memory
         self.stages = Stages(folder)
         self.records: list[StageRecord] = []
         self.warnings: list[str] = []
 
-    def execute(self, starts_over: bool) -> Outcome:
+    def execute(self, starts_over: bool, on_verdict: Callable[[Inspection], None] | None = None) -> Outcome:
         """Run the stages in their order."""
         key = measurement_key(self.prepared)
         if starts_over or not self.stages.is_finished("inputs", key):
@@ -131,6 +154,9 @@ class _InspectionRun:
                 (self.folder / name).unlink(missing_ok=True)
             self.stages.restart("inputs")
         self.stages.finish("inputs", key)
+        if on_verdict is not None:
+            on_verdict(self._measure_in_photos(key, starts_over))
+            starts_over = False
         found = self._reconstruct(starts_over)
         self.stages = Stages(self.folder)  # the reconstruction has changed its file
         inspection = self._measure(key)
@@ -147,14 +173,32 @@ class _InspectionRun:
         options = replace(prepared.reconstruct, starts_over=starts_over)
         with _measuring():
             found = reconstruct(
-                job.photo_source, self.folder, prepared.part, job.camera, options, progress=self.progress
-            )
+                job.photo_source, self.folder, prepared.part, job.camera, options, progress=self.progress,
+                memory=self.memory,
+            )  # fmt: skip
         for name, title in _RECONSTRUCTION.items():
             state = "done" if name in found.seconds else "kept"
             self.records.append(StageRecord(title, state, found.seconds.get(name, 0.0), _about(found, name)))
         self.warnings += found.intake.warnings
         self.warnings += found.coverage.advice if found.coverage is not None else ()
         return found
+
+    def _measure_in_photos(self, inputs: str, starts_over: bool) -> Inspection:
+        """The measurement without what follows from the dense cloud and from halves of the photos."""
+        prepared, job, path = self.prepared, self.prepared.job, self.folder / "inspection.json"
+        options = replace(prepared.reconstruct, starts_over=starts_over, last_stage="scale")
+        if self.stages.key("measure") is None or starts_over:
+            with _measuring():
+                reconstruct(
+                    job.photo_source, self.folder, prepared.part, job.camera, options, progress=self.progress,
+                    memory=self.memory,
+                )  # fmt: skip
+            self.stages = Stages(self.folder)
+            key = key_of(inputs, self.stages.key("scale"))
+            if not self.stages.is_finished("verdict", key) or not path.is_file():
+                save_inspection(measured_in_photos(self.folder, prepared, self.progress), path)
+                self.stages.finish("verdict", key)
+        return load_inspection(path, prepared.part.model)
 
     def _measure(self, inputs: str) -> Inspection:
         part, path = self.prepared.part, self.folder / "inspection.json"
@@ -237,6 +281,21 @@ class _InspectionRun:
         if all(path.is_file() for path in files):
             self.stages.finish(name, f"{key} {content_key(files)}")
         self.records.append(StageRecord(title, "done", time.perf_counter() - began, note))
+
+
+def measured_in_photos(folder: Path, prepared: Prepared, progress: Progress) -> Inspection:
+    """The measurement of a folder's reconstruction by sweep and edges, without a cloud.
+
+    Raises:
+        CannotMeasureError: the reconstruction has no frame, contradicts the CAD, or does not show the datums.
+    """
+    from arview.measurement.folder import read_folder
+    from arview.measurement.run import measure
+
+    methods = tuple(one for one in prepared.measure.methods if one != "cloud")
+    options = replace(prepared.measure, methods=methods, maps_folder=None)
+    with _measuring():
+        return measure(read_folder(folder, with_cloud=False), prepared.part, options, progress=progress)
 
 
 @contextmanager

@@ -14,6 +14,7 @@ from arview.camera.exif import PhotoExif
 from arview.core.progress import StepProgress
 from arview.errors import ArviewError, InputError, MismatchError
 from arview.reconstruction.intake.checks import CheckOptions, PhotoCheck, check_photo, same_views, thumbnail
+from arview.reconstruction.intake.kept import kept
 from arview.reconstruction.intake.lenses import Lens, lenses_of
 from arview.reconstruction.intake.reading import RAW_SUFFIXES, Pixels, glance, photo_paths
 from arview.reconstruction.types import Photo
@@ -146,6 +147,10 @@ def assess(
 
 def read_and_check(path: Path, name: str) -> ReadPhoto | str:
     """The photo as far as the checks need it, or why it cannot be read."""
+    return kept(f"check {name}", path, lambda: _read_and_check(path, name))
+
+
+def _read_and_check(path: Path, name: str) -> ReadPhoto | str:
     if path.suffix.lower() in RAW_SUFFIXES:
         return "is a raw photo; develop it to JPEG, with the same settings for all"
     try:

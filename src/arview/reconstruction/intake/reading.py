@@ -20,6 +20,7 @@ from arview.camera.exif import (
     open_picture,
 )
 from arview.errors import InputError
+from arview.reconstruction.intake.kept import kept
 from arview.video.pictures import sorted_naturally
 
 if TYPE_CHECKING:
@@ -49,7 +50,12 @@ def read_photo(path: str | Path) -> Pixels:
     Raises:
         InputError: the file is missing, empty, truncated or not a picture.
     """
-    data = read_bytes(Path(path))
+    return kept("picture", Path(path), lambda: _read(Path(path)))
+
+
+def _read(path: Path) -> Pixels:
+    """See `read_photo`."""
+    data = read_bytes(path)
     try:
         with open_picture(data) as picture:
             return _upright(_pixels(picture, "RGB"), exif_of(picture).orientation)

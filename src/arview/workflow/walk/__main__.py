@@ -1,0 +1,10 @@
+"""``python -m arview.workflow.walk JOB``: measure a job while its photos arrive; ends when the job is done."""
+
+from __future__ import annotations
+
+import sys
+
+from arview.workflow.walk.worker import main
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
