@@ -52,7 +52,7 @@ def test_without_decisions_nothing_is_said(job: Path) -> None:
 
 def test_a_deviation_is_accepted_and_released(job: Path) -> None:
     decide_component(job, "block_2", True, "agreed with the customer", "see mail", "Ada", "0003.jpg")
-    assert state_of_record(job).sentence.startswith("not signed: with 1 deviation accepted")
+    assert state_of_record(job).sentence.startswith("not signed: 1 deviation accepted")
     sign_inspection(job, "Grace")
     state = state_of_record(job)
     assert state.is_released

@@ -309,7 +309,7 @@ def test_postgresql_refuses_changes(postgresql: str, tmp_path: Path) -> None:
         assert store.add(tmp_path / "pg.json").is_new is False
         assert store.find(added.content_hash[:10])[0].serial == "pg-1"
         assert [row["dx_mm"] for row in store.components([added.id])] == [0.3]
-    engine = sa.create_engine(store_module._url(postgresql))
+    engine = sa.create_engine(store_module.store_url(postgresql))
     for statement in (
         "UPDATE arview_results SET verdict = 'pass'", "DELETE FROM arview_results", "TRUNCATE arview_results CASCADE",
         "UPDATE arview_components SET dx_mm = 0", "DELETE FROM arview_components",
@@ -349,7 +349,7 @@ def test_wrong_stores(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     outside.close()
     with pytest.raises(InputError, match="newer arview"):
         HistoryStore(newer)
-    monkeypatch.setattr(store_module, "_file_system", lambda path: "nfs4")
+    monkeypatch.setattr(store_module, "file_system", lambda path: "nfs4")
     with pytest.raises(InputError, match=r"network file system \(nfs4\).*PostgreSQL"):
         HistoryStore(tmp_path / "share.sqlite")
 
@@ -361,7 +361,7 @@ def test_without_the_driver(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_the_file_system_of_a_path() -> None:
-    assert store_module._file_system(Path("/proc/self")) == "proc"
+    assert store_module.file_system(Path("/proc/self")) == "proc"
 
 
 # ---- statistics

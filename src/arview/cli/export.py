@@ -11,7 +11,7 @@ from arview.cli.common import UNIT, main, output_path, say
 from arview.core.atomic import write_file
 from arview.errors import InputError, OutputError
 
-FORMATS = ("csv", "qif", "dfq", "glb", "html", "pdf")
+FORMATS = ("csv", "qif", "dfq", "glb", "html", "pdf", "decisions")
 
 
 def _parse_formats(ctx: click.Context, parameter: click.Parameter, value: str) -> tuple[str, ...]:
@@ -22,7 +22,7 @@ def _parse_formats(ctx: click.Context, parameter: click.Parameter, value: str) -
 
 
 @main.command(
-    short_help="Write an inspection as CSV, QIF, DFQ, GLB, HTML or PDF.",
+    short_help="Write an inspection as CSV, QIF, DFQ, GLB, HTML or PDF, and its decisions.",
     epilog="""\b
 Examples:
   arview export out/inspection.json --to csv
@@ -30,7 +30,7 @@ Examples:
   arview export out/inspection.json --to glb --part part.toml -o deviations.glb
 
 \b
-csv   one line per component
+csv   one line per component, with the latest decision of a person about it
 qif   QIF 3.0 results (ISO 23952): position with spherical zone, x y z, rotation and presence, with
       standard uncertainties
 dfq   Q-DAS ASCII transfer format (AQDEF): distance, dx, dy, dz, tilt and presence of each component as
@@ -38,6 +38,8 @@ dfq   Q-DAS ASCII transfer format (AQDEF): distance, dx, dy, dz, tilt and presen
 glb   glTF 2.0: components at nominal and measured place, coloured by verdict, with arrows; needs --part
 html  the report, as `arview report` writes it
 pdf   the report as PDF
+decisions
+      decisions.csv: decisions of people about it, ticks of rework and signatures, a line for each
 
 \b
 An undetermined quantity has no value in any of them. Numbers are rounded to what their U allows, with U
@@ -47,7 +49,7 @@ src/arview/inspection/schema/inspection-json.md and by the JSON Schema next to i
 )
 @click.argument("inspection", metavar="INSPECTION")
 @click.option("--to", "formats", callback=_parse_formats, required=True, metavar="LIST",
-              help="csv, qif, dfq, glb, html, pdf, separated by commas.")  # fmt: skip
+              help="csv, qif, dfq, glb, html, pdf, decisions, separated by commas.")  # fmt: skip
 @click.option("-o", "--output", metavar="FILE|FOLDER", help="File to write, or folder; default: next to INSPECTION.")
 @click.option("--part", "part_path", metavar="PART", help="Part file or CAD file, for glb, html and pdf.")
 @click.option("--folder", metavar="OUT", help="Folder of `arview reconstruct`, for html and pdf.")
@@ -64,6 +66,8 @@ def export(
 ) -> None:
     """Write INSPECTION in other formats."""
     from arview.cad import load_part
+    from arview.decisions import decisions_csv, log_of
+    from arview.decisions.table import decided_cells
     from arview.inspection import load_inspection
     from arview.inspection.export import to_csv, to_dfq, to_glb, to_qif
     from arview.inspection.fingerprint import fingerprint_of_file
@@ -75,8 +79,12 @@ def export(
         raise InputError("glb: the CAD is needed; name it with --part")
     loaded = load_inspection(source, None if part is None else part.model)
     sha256 = fingerprint_of_file(source)
+    content = log_of(source).content()
+    for line in (*content.faults, *content.notices):
+        say(line)
     made: dict[str, Callable[[], bytes]] = {
-        "csv": lambda: to_csv(loaded, sha256).encode("utf-8"),
+        "csv": lambda: to_csv(loaded, sha256, decided_cells(content.entries)).encode("utf-8"),
+        "decisions": lambda: decisions_csv(content.entries, loaded.part, loaded.serial).encode("utf-8"),
         "qif": lambda: to_qif(loaded, sha256),
         "dfq": lambda: to_dfq(loaded, sha256),
     }
@@ -98,6 +106,8 @@ def export(
 
 def _targets(source: Path, formats: tuple[str, ...], output: str | None, part_path: str | None) -> dict[str, Path]:
     """The file of each format; a folder that is not there is made where the name ends in / or has no ending."""
+    from arview.decisions import log_of
+
     inputs = [source, part_path]
     folder = source.parent if output is None else Path(output)
     if output is not None and not folder.is_dir():
@@ -109,7 +119,10 @@ def _targets(source: Path, formats: tuple[str, ...], output: str | None, part_pa
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise OutputError(f"{output}: the folder cannot be made ({error.strerror})") from error
-    return {name: output_path(str(folder / f"{source.stem}.{name}"), inputs) for name in formats}
+    names = {name: f"{source.stem}.{name}" for name in formats}
+    if "decisions" in names:
+        names["decisions"] = log_of(source).path.with_suffix(".csv").name
+    return {name: output_path(str(folder / file), inputs) for name, file in names.items()}
 
 
 @main.group(

@@ -16,6 +16,7 @@ from arview.core.atomic import write_file
 from arview.errors import ArviewError, InputError
 
 if TYPE_CHECKING:
+    from arview.decisions import Decision, RecordState
     from arview.history import Capability, ComponentSeries, ControlChart, HistoryStore, StoredResult
 
 _SHOWN_CHANGES = 8
@@ -77,7 +78,8 @@ Examples:
   arview history add out/*/inspection.json --station cell-3 --store /data/plate.sqlite
 
 \b
-Files that are not inspections are named and left out. Results already in the store stay as they are.""",
+Files that are not inspections are named and left out. Results already in the store stay as they are;
+decisions beside them that the store does not have (decisions.jsonl) are added.""",
     exit_codes={
         ExitCode.DONE: "all are in the store",
         ExitCode.BAD_INPUT: "a file is not an inspection, or other bad input; the others were added",
@@ -90,7 +92,7 @@ Files that are not inspections are named and left out. Results already in the st
 @STORE
 def add(inspections: tuple[str, ...], station: str | None, store: str | None) -> None:
     """Add the INSPECTIONs to the store."""
-    new = same = 0
+    new = same = decided = 0
     failed: list[str] = []
     with _open(store) as opened, progress_bar("history", len(inspections)) as progress:
         for done, path in enumerate(inspections, 1):
@@ -99,16 +101,21 @@ def add(inspections: tuple[str, ...], station: str | None, store: str | None) ->
             except InputError as error:
                 failed.append(str(error))
                 continue
+            failed += [f"{path}: {fault}; decisions are left out" for fault in added.decision_faults]
+            decided += added.decisions
             new, same = new + added.is_new, same + (not added.is_new)
             if len(inspections) == 1:
                 state = "added as" if added.is_new else "already there as"
                 click.echo(f"{path}: {state} {added.id}, {added.content_hash[:12]}")
+                if added.decisions:
+                    click.echo(f"{added.decisions} new decisions")
             progress(done, len(inspections))
         name = opened.name
     for reason in failed:
         say(f"error: {reason}")
     if len(inspections) > 1:
-        click.echo(f"{new} added, {same} already there, {len(failed)} refused: {name}")
+        more = f", {decided} new decisions" if decided else ""
+        click.echo(f"{new} added, {same} already there, {len(failed)} refused{more}: {name}")
     if failed:
         click.get_current_context().exit(ExitCode.BAD_INPUT)
 
@@ -140,10 +147,12 @@ def list_results(
         found = opened.listed(
             part, serial, station, verdict, _moment(since, zone), limit=limit, with_voided=voided
         )  # fmt: skip
+        states = _states(opened, found)
     _table(
-        ("no.", f"measured ({zone})", "part", "serial", "station", "verdict", "hash"),
+        ("no.", f"measured ({zone})", "part", "serial", "station", "verdict", "decided", "hash"),
         [(str(r.id), f"{r.measured.astimezone(zone):%Y-%m-%d %H:%M:%S}", r.part, r.serial or "-", r.station,
-          "void" if r.void is not None else r.verdict.replace("_", " "), r.content_hash[:12]) for r in found],
+          "void" if r.void is not None else r.verdict.replace("_", " "), _decided_word(states.get(r.id)),
+          r.content_hash[:12]) for r in found],
     )  # fmt: skip
     click.echo(f"{len(found)} result{'s' * (len(found) != 1)}")
 
@@ -162,7 +171,10 @@ def show(result: str, output: str | None, store: str | None) -> None:
         found, document = opened.find(result)
         order = {one["name"]: place for place, one in enumerate(json.loads(document)["components"])}
         rows = sorted(opened.components([found.id]), key=lambda row: order.get(row["name"], 0))
+        entries, state = opened.decisions(found.id), _states(opened, [found]).get(found.id)
     _about(found)
+    if state is not None:
+        click.echo(f"decided  {state.sentence}")
     _table(
         ("component", "dx", "dy", "dz", "distance", "U", "tolerance", "tilt", "verdict"),
         [(row["name"], *(_number(row[key], sign) for key, sign in
@@ -170,6 +182,8 @@ def show(result: str, output: str | None, store: str | None) -> None:
                           ("tolerance_mm", ""))),
           _number(row["tilt_deg"], "", 2), row["finding"] or row["verdict"].replace("_", " ")) for row in rows],
     )  # fmt: skip
+    if entries:
+        _print_decisions([(found, one) for one in entries], UTC)
     if target is not None:
         text = json.dumps(json.loads(document), indent=2, ensure_ascii=False) + "\n"
         write_file(target, text.encode())
@@ -357,6 +371,85 @@ def check(store: str | None) -> None:
         click.get_current_context().exit(ExitCode.FAIL)
 
 
+@history.command(
+    "decisions",
+    short_help="List what people decided about results.",
+    epilog="""\b
+Examples:
+  arview history decisions --part plate
+  arview history decisions --serial PL-0417 -o decisions.csv
+
+\b
+`arview history add` copies them from the decisions.jsonl beside an inspection.""",
+)
+@click.option("-o", "--output", metavar="FILE", help="Write them as CSV.")
+@ZONE
+@PART
+@SERIAL
+@STATION
+@SINCE
+@STORE
+def list_decisions(
+    output: str | None, zone: tzinfo, part: str | None, serial: str | None, station: str | None, since: str | None,
+    store: str | None,
+) -> None:  # fmt: skip
+    """List the decisions, ticks and signatures about the results."""
+    from arview.decisions import decisions_csv
+
+    target = None if output is None else output_path(output, [])
+    with _open(store, must_exist=True) as opened:
+        found = opened.listed(part, serial, station, since=_moment(since, zone))
+        decided = opened.decided([one.id for one in found])
+    rows = [(one, entry) for one in found for entry in decided.get(one.id, ())]
+    if target is None:
+        _print_decisions(rows, zone)
+        click.echo(f"{len(rows)} entr{'y' if len(rows) == 1 else 'ies'}")
+        return
+    pieces = [decisions_csv(decided[one.id], one.part, one.serial) for one in found if one.id in decided]
+    head = decisions_csv(())
+    write_file(target, (head + "".join(piece.removeprefix(head) for piece in pieces)).encode("utf-8"))
+    click.echo(f"wrote {target}: {len(rows)} entries")
+
+
+def _print_decisions(rows: Sequence[tuple[StoredResult, Decision]], zone: tzinfo) -> None:
+    from arview.decisions.table import decision_word
+
+    cells: list[tuple[str, ...]] = []
+    for result, one in rows:
+        word = decision_word(one) or one.kind
+        if one.step is not None:
+            word = f"step {one.step + 1} {'done' if one.is_done else 'not done'}"
+        time = f"{one.time.astimezone(zone):%Y-%m-%d %H:%M:%S}"
+        text = " ".join("; ".join(part for part in (one.reason, one.note) if part).split())
+        cells.append(
+            (f"{result.id}.{one.number}", time, result.serial or "-", one.component or "-", word, one.by, text)
+        )
+    _table(("no.", f"decided ({zone})", "serial", "component", "decision", "by", "reason and note"), cells)
+
+
+def _states(store: HistoryStore, found: Sequence[StoredResult]) -> dict[int, RecordState]:
+    """What people decided about results, for those about which there is something."""
+    from arview.history.decided import stored_state
+
+    by_id = {one.id: one for one in found}
+    return {
+        number: stored_state(store.find(by_id[number].content_hash)[1], by_id[number].content_hash, entries)
+        for number, entries in store.decided(list(by_id)).items()
+    }
+
+
+def _decided_word(state: RecordState | None) -> str:
+    if state is None:
+        return "-"
+    if state.faults:
+        return "changed"
+    if state.is_released:
+        return "released"
+    if state.signature is None:
+        return "not signed"
+    return "void" if state.signature.void else "not released"
+
+
 def _open(store: str | None, must_exist: bool = False) -> HistoryStore:
     from arview.history.store import HistoryStore, default_store
 
@@ -390,7 +483,9 @@ def _number(value: float | None, sign: str, digits: int = 3) -> str:
 def _table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> None:
     """Print columns as narrow as their content allows: text to the left, numbers to the right."""
     widths = [max(len(row[i]) for row in [head, *rows]) for i in range(len(head))]
-    is_text = [i == 0 or name in ("hash", "serial") or name.startswith("measured") for i, name in enumerate(head)]
+    is_text = [
+        i == 0 or name in ("hash", "serial") or name.startswith(("measured", "decided")) for i, name in enumerate(head)
+    ]
     numeric = [
         bool(rows) and not is_text[i] and all(row[i][:1] in "+-?0123456789" for row in rows) for i in range(len(head))
     ]

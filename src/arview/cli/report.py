@@ -1,13 +1,17 @@
-"""The command report: an inspection → one HTML file, and a PDF to file."""
+"""What is kept of an inspection: the commands report, rework, decide, sign and decisions."""
 
 from __future__ import annotations
 
+import json
+import re
 from pathlib import Path
 
 import click
 
 from arview.cli.common import UNIT, main, output_path, say, stage_bar
-from arview.errors import InputError
+from arview.cli.exit_codes import ExitCode
+from arview.core.atomic import write_file
+from arview.errors import InputError, OutputError
 
 
 @main.command(
@@ -21,8 +25,9 @@ Examples:
 \b
 INSPECTION is the file of `arview measure`. The report holds the verdict, a table of components, a picture
 of each finding (photo, ghost at the nominal place, arrow), distance map and histogram, uncertainty
-budget, datums, photos, how it was measured, and a 3D view of CAD, cloud and arrows. It is one file that
-needs no network. The PDF has all of this except the 3D view, and the inspection as an attachment.
+budget, datums, photos, how it was measured, a 3D view of CAD, cloud and arrows, the rework of what is out
+of tolerance, and what people decided. It is one file that needs no network. The PDF has all of this except
+the 3D view, and the inspection as an attachment.
 
 \b
 Pictures are made from the photos in the folder of `arview reconstruct` (default: that of INSPECTION), and
@@ -62,3 +67,202 @@ def report(
     for path in (html, paper):
         if path is not None:
             click.echo(f"wrote {path}")
+
+
+@main.command(
+    short_help="Say how components out of tolerance are to be moved, with drawings.",
+    epilog="""\b
+Examples:
+  arview rework out/inspection.json --part part.toml
+  arview rework out/inspection.json --part part.toml -o rework/
+  arview rework out/inspection.json --part part.toml --json
+
+\b
+For each component that is out of tolerance: which way and how far to move and turn it, in directions that
+are on the part (towards a neighbour or a datum hole, away from its seat, up), with U. What is below U is
+not asked for, and what is undetermined is said. Missing components are to be installed; foreign objects
+are no rework. The kind of rework, its steps, pictures and directions come from the part file
+(`arview check --help` shows [components.NAME.rework]).
+
+\b
+With -o, each gets a drawing, COMPONENT.svg: the place at true scale when printed at 100 %, and the
+displacement magnified, with the tolerance zone.""",
+    exit_codes={
+        ExitCode.DONE: "nothing is out of tolerance",
+        ExitCode.FAIL: "there is rework to do",
+    },
+)
+@click.argument("inspection", metavar="INSPECTION")
+@click.option(
+    "--part", "part_path", metavar="PART", required=True, help="Part file or CAD file that was measured against."
+)
+@click.option("-o", "--output", metavar="FOLDER", help="Folder for the drawings, which is made if needed.")
+@click.option("--json", "as_json", is_flag=True, help="Print the instructions as JSON.")
+@UNIT
+def rework(inspection: str, part_path: str, output: str | None, as_json: bool, unit: str | None) -> None:
+    """Say what to do about the components of INSPECTION that are out of tolerance."""
+    from arview.cad import load_part
+    from arview.inspection import load_inspection
+    from arview.rework import drawing_svg, instruction_document, instructions
+
+    part = load_part(part_path, unit)
+    loaded = load_inspection(inspection, part.model)
+    folder = None if output is None else _made_folder(output)
+    found = instructions(part, loaded)
+    if as_json:
+        click.echo(json.dumps([instruction_document(one) for one in found], indent=2, ensure_ascii=False))
+    for one in () if as_json else found:
+        click.echo(f"{one.component} ({one.how}): {one.what}")
+        for text in (one.text, one.remark):
+            if text:
+                click.echo(f"  {text}")
+        for number, step in enumerate(one.steps, 1):
+            click.echo(f"  {number}. {step}")
+    if not found and not as_json:
+        click.echo("nothing is out of tolerance: no rework")
+    if folder is not None:
+        for one in found:
+            # Names of components may hold what a file name may not.
+            target = folder / f"{re.sub(r'[^A-Za-z0-9._-]+', '_', one.component).lstrip('.') or 'component'}.svg"
+            write_file(target, drawing_svg(part, loaded, one.component).encode("utf-8"))
+            say(f"wrote {target}")
+    click.get_current_context().exit(ExitCode.FAIL if found else ExitCode.DONE)
+
+
+def _made_folder(path: str) -> Path:
+    folder = Path(path)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"{path}: the folder cannot be made ({error.strerror or error})") from error
+    return folder
+
+
+BY = click.option("--by", required=True, metavar="NAME", help="Who decides.")
+NOTE = click.option("--note", default="", metavar="TEXT", help="Anything else.")
+
+
+@main.command(
+    short_help="Decide about a component: OK or not OK, and why.",
+    epilog="""\b
+Examples:
+  arview decide out/ link_1 --not-ok --reason "weld cracked" --by Ada
+  arview decide out/ post_1 --ok --reason "agreed with the customer" --by Ada --photo 0003.jpg
+
+\b
+JOB is a job folder, or an inspection.json. Decisions are appended to decisions.jsonl beside it and are
+never changed: each line has the hash of the one before. They never change what was measured: report, CSV
+and history show both. A decision after a signature makes it void. A report.html beside the inspection is
+brought up to date.""",
+)
+@click.argument("job", metavar="JOB")
+@click.argument("component", metavar="COMPONENT")
+@click.option("--ok/--not-ok", "is_ok", default=None, help="Take the component as it is, or not.")
+@click.option("--reason", default="", metavar="TEXT", help="Why; needed unless a component in tolerance is OK.")
+@click.option("--photo", metavar="NAME", help="A photo of the job that shows it.")
+@NOTE
+@BY
+def decide(job: str, component: str, is_ok: bool | None, reason: str, photo: str | None, note: str, by: str) -> None:
+    """Decide about COMPONENT of JOB."""
+    from arview.decisions import decide_component
+
+    if is_ok is None:
+        raise click.UsageError("give --ok or --not-ok")
+    made = decide_component(job, component, is_ok, reason, note, by, photo)
+    click.echo(f"entry {made.number}: {component} {'OK' if is_ok else 'not OK'}, {made.by}")
+    _told_state(job)
+
+
+@main.command(
+    short_help="Sign an inspection.",
+    epilog="""\b
+Examples:
+  arview sign out/ --by "Grace Hopper"
+  arview sign out/ --by "Grace Hopper" --note "shift 2" --store /data/plate.sqlite
+
+\b
+The part is released if each component passed or was accepted with a reason, and none was rejected;
+otherwise the signature says that it is not. A later decision, or another inspection.json, makes it
+void.""",
+    exit_codes={
+        ExitCode.DONE: "signed and released",
+        ExitCode.FAIL: "signed, not released: a component was rejected or is open",
+    },
+)
+@click.argument("job", metavar="JOB")
+@NOTE
+@BY
+@click.option("--store", metavar="FILE|URL", help="Add inspection and decisions to this results store.")
+def sign(job: str, note: str, by: str, store: str | None) -> None:
+    """Sign the inspection of JOB as it is now."""
+    from arview.decisions import sign_inspection
+
+    sign_inspection(job, by, note)
+    is_released = _told_state(job)
+    if store is not None:
+        from arview.decisions.folder import inspection_path
+        from arview.history import HistoryStore
+
+        with HistoryStore(store) as opened:
+            added = opened.add(inspection_path(job))
+            click.echo(f"{opened.name}: result {added.id}, {added.decisions} new entries")
+    click.get_current_context().exit(ExitCode.DONE if is_released else ExitCode.FAIL)
+
+
+@main.command(
+    short_help="List the decisions about an inspection, and check that none was changed.",
+    epilog="""\b
+Examples:
+  arview decisions out/
+  arview decisions out/ -o decisions.csv""",
+    exit_codes={
+        ExitCode.DONE: "the log is as it was written",
+        ExitCode.FAIL: "a line was changed or removed; it is named",
+    },
+)
+@click.argument("job", metavar="JOB")
+@click.option("-o", "--output", metavar="CSV", help="Write them as CSV.")
+def decisions(job: str, output: str | None) -> None:
+    """List the decisions, ticks and signatures of JOB."""
+    from arview.decisions import decisions_csv, log_of
+    from arview.decisions.folder import inspection_path
+    from arview.decisions.table import decision_word
+    from arview.inspection import load_inspection
+
+    path = inspection_path(job)
+    if not path.is_file():
+        raise InputError(f"{path}: no such inspection; give a job folder or an inspection.json")
+    target = None if output is None else output_path(output, [path, log_of(job).path])
+    content = log_of(job).content()
+    for one in content.entries:
+        words = [one.component, decision_word(one)]
+        if one.step is not None:
+            words.append(f"step {one.step + 1} {'done' if one.is_done else 'not done'}")
+        text = "; ".join(word for word in (one.reason, one.note) if word)
+        line = " ".join(word for word in [one.kind, *words] if word)
+        click.echo(f"{one.number:>4}  {one.time:%Y-%m-%d %H:%M:%S}  {one.by}: {line}{f' ({text})' if text else ''}")
+    if target is not None:
+        loaded = load_inspection(path)
+        write_file(target, decisions_csv(content.entries, loaded.part, loaded.serial).encode("utf-8"))
+        click.echo(f"wrote {target}")
+    _told_state(job)
+    if content.faults:
+        click.get_current_context().exit(ExitCode.FAIL)
+
+
+def _told_state(job: str) -> bool:
+    """Print what was decided so far, and bring the report up to date; whether the part is released."""
+    from arview.decisions import state_of_record
+    from arview.decisions.folder import inspection_path
+    from arview.report.decisions import update_report
+
+    state = state_of_record(job)
+    for line in (*state.faults, *state.notices):
+        say(line)
+    if state.sentence:
+        click.echo(state.sentence)
+    path = inspection_path(job)
+    page = path.with_name("report.html")
+    if page.is_file() and not update_report(page, path):
+        say(f"{page}: has no place for these decisions; write it again with `arview report`")
+    return state.is_released

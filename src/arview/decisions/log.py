@@ -12,11 +12,11 @@ import hashlib
 import json
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import IO, Any
 
 from arview.core.atomic import replacing
 from arview.decisions.entry import FIRST, Decision, checked_name, checked_text, entry_of, line_of
@@ -182,7 +182,7 @@ class DecisionLog:
         """Add an entry behind the last one, under the lock; a torn line is set aside first."""
         try:
             is_new = not self.path.exists()
-            with self.path.open("a+b") as file, _locked(file, fcntl.LOCK_EX):
+            with self.path.open("a+b", buffering=0) as file, _locked(file, fcntl.LOCK_EX):
                 file.seek(0)
                 data = file.read()
                 content = self._parsed(data)
@@ -201,12 +201,10 @@ class DecisionLog:
                 made = replace(made, sha256=_sha256(line))
                 if content.torn:
                     self._set_aside(content.torn)
-                    file.truncate(len(data) - len(content.torn))
+                    data = data.removesuffix(content.torn)
+                    file.truncate(len(data))
                 # A last line that is whole but for its end gets it.
-                begin = b"\n" if data and not content.torn and not data.endswith(b"\n") else b""
-                file.write(begin + line + b"\n")
-                file.flush()
-                os.fsync(file.fileno())
+                _write_durably(file, len(data), (b"\n" if data and not data.endswith(b"\n") else b"") + line + b"\n")
                 if is_new:
                     _sync_folder(self.path.parent)
                 self._write_end(made)
@@ -306,13 +304,26 @@ class DecisionLog:
 
 
 @contextmanager
-def _locked(file: BinaryIO, kind: int) -> Iterator[None]:
+def _locked(file: IO[bytes], kind: int) -> Iterator[None]:
     """Hold the lock of an open file; a process that dies gives it back."""
     fcntl.flock(file, kind)
     try:
         yield
     finally:
         fcntl.flock(file, fcntl.LOCK_UN)
+
+
+def _write_durably(file: IO[bytes], length: int, content: bytes) -> None:
+    """Write behind the first ``length`` bytes of a file; what could not be brought to the disk is taken back."""
+    try:
+        rest = memoryview(content)
+        while len(rest):
+            rest = rest[os.write(file.fileno(), rest) :]
+        os.fsync(file.fileno())
+    except OSError:
+        with suppress(OSError):
+            os.ftruncate(file.fileno(), length)
+        raise
 
 
 def _sync_folder(folder: Path) -> None:

@@ -132,7 +132,7 @@ def _sentence(
     if signature.void:
         return f"the signature of {who}, is void: {signature.void}"
     if is_released:
-        return f"released by {who}{_tail(', ', inspection, accepted, (), ())}"
+        return f"released by {who}{_tail(', with ' if accepted else ', ', inspection, accepted, (), ())}"
     return f"signed by {who}, not released{_tail(': ', inspection, accepted, rejected, undecided)}"
 
 
@@ -144,7 +144,7 @@ def _tail(
     parts = []
     if accepted:
         reasons = "; ".join(f"{one.component}: {one.reason or 'no reason given'}" for one in accepted)
-        parts.append(f"with {len(accepted)} deviation{'s' * (len(accepted) > 1)} accepted ({reasons})")
+        parts.append(f"{len(accepted)} deviation{'s' * (len(accepted) > 1)} accepted ({reasons})")
     if rejected:
         parts.append("not OK: " + "; ".join(f"{one.component}: {one.reason}" for one in rejected))
     if undecided:

@@ -30,6 +30,15 @@ def decisions_csv(entries: Sequence[Decision], part: str = "", serial: str = "")
     return out.getvalue()
 
 
+def decided_cells(entries: Sequence[Decision]) -> dict[str, tuple[str, str, str, str]]:
+    """Decision, reason, name and time of the latest decision about each component, for a table of components."""
+    return {
+        one.component: (decision_word(one), _text(one.reason), _text(one.by), stamp(one.time))
+        for one in entries
+        if one.kind == "decision"
+    }
+
+
 def decision_word(one: Decision) -> str:
     """``OK`` or ``not OK``; empty for what is no decision."""
     return "" if one.is_ok is None else "OK" if one.is_ok else "not OK"

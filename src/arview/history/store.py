@@ -14,14 +14,13 @@ import socket
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, TypeVar
 
 import sqlalchemy as sa
 from sqlalchemy.exc import (
-    ArgumentError,
     DBAPIError,
     IntegrityError,
     NoSuchModuleError,
@@ -29,14 +28,15 @@ from sqlalchemy.exc import (
     SQLAlchemyError,
 )
 
+from arview.decisions import Decision, log_of
 from arview.errors import InputError, MissingDependencyError, OutputError
-from arview.history.tables import STORE_VERSION, about, components, guards, metadata, results, voids
+from arview.history.connection import BUSY_S, begin_sqlite, file_system, prepare_sqlite, store_url
+from arview.history.decided import decided_faults, decision_of_row, new_rows
+from arview.history.tables import STORE_VERSION, about, components, decisions, guards, metadata, results, voids
 from arview.inspection import Inspection, load_inspection
 from arview.inspection.fingerprint import content_hash
 from arview.inspection.summary import overall_verdict
 
-_BUSY_S = 30.0
-"""Time that a writer waits for others; a result is written in milliseconds."""
 _TRIES = 6
 """Attempts after errors that may be temporary."""
 _TEMPORARY = ("locked", "busy", "deadlock", "serialize", "could not connect", "server closed", "terminating connection")
@@ -48,11 +48,21 @@ Found = TypeVar("Found")
 
 @dataclass(frozen=True)
 class AddedResult:
-    """An added inspection: its number and hash, and whether it was new."""
+    """An added inspection.
+
+    Attributes:
+        id: its number.
+        content_hash: its hash.
+        is_new: whether the store did not have it.
+        decisions: number of decisions beside it that were new.
+        decision_faults: why decisions were left out: their log was changed, or is not the one stored before.
+    """
 
     id: int
     content_hash: str
     is_new: bool
+    decisions: int = 0
+    decision_faults: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -118,20 +128,20 @@ class HistoryStore:
     """
 
     def __init__(self, where: str | Path, must_exist: bool = False) -> None:
-        url = _url(str(where))
+        url = store_url(str(where))
         self.name = url.render_as_string(hide_password=True) if url.host else str(url.database)
         self.is_sqlite = url.get_backend_name() == "sqlite"
         if self.is_sqlite:
             self._check_file(Path(str(url.database)), must_exist)
         try:
-            self._engine = sa.create_engine(url, **({"connect_args": {"timeout": _BUSY_S}} if self.is_sqlite else {}))
+            self._engine = sa.create_engine(url, **({"connect_args": {"timeout": BUSY_S}} if self.is_sqlite else {}))
         except (ImportError, NoSuchModuleError) as error:
             raise MissingDependencyError(
                 f"{self.name}: the driver is not installed: pip install 'arview[postgres]' ({error})"
             ) from error
         if self.is_sqlite:
-            sa.event.listen(self._engine, "connect", _prepare_sqlite)
-            sa.event.listen(self._engine, "begin", _begin_sqlite)
+            sa.event.listen(self._engine, "connect", prepare_sqlite)
+            sa.event.listen(self._engine, "begin", begin_sqlite)
         self._make_tables(upgrades=not must_exist)
 
     def close(self) -> None:
@@ -145,7 +155,7 @@ class HistoryStore:
         self.close()
 
     def add(self, inspection: str | Path, station: str | None = None) -> AddedResult:
-        """Add the inspection in a file unless the store contains it.
+        """Add the inspection in a file unless the store contains it, and the decisions beside it that are new.
 
         Args:
             inspection: ``inspection.json``, which is checked first.
@@ -170,7 +180,42 @@ class HistoryStore:
             "tool": f"{loaded.provenance.tool} {loaded.provenance.version}",
             "document": json.dumps(document, ensure_ascii=False, allow_nan=False),
         }
-        return self._retried(lambda: self._insert(row, loaded))
+        added = self._retried(lambda: self._insert(row, loaded))
+        content = log_of(path).content()
+        if not content.entries and not content.faults:
+            return added
+        count, faults = (0, content.faults) if content.faults else self._add_decisions(added.id, content.entries)
+        return replace(added, decisions=count, decision_faults=tuple(faults))
+
+    def _add_decisions(self, result_id: int, entries: Sequence[Decision]) -> tuple[int, Sequence[str]]:
+        """Add the entries of a log that the store does not have; their number, and what contradicts those stored."""
+
+        def insert() -> tuple[int, Sequence[str]]:
+            with self._begin(writes=True) as connection:
+                known = {
+                    int(row.number): str(row.sha256)
+                    for row in connection.execute(sa.select(decisions).where(decisions.c.result_id == result_id))
+                }
+                rows, faults = new_rows(result_id, entries, known)
+                if rows and not faults:
+                    connection.execute(sa.insert(decisions), rows)
+                return (0 if faults else len(rows)), faults
+
+        return self._retried(insert)
+
+    def decisions(self, result_id: int) -> tuple[Decision, ...]:
+        """The decisions, ticks and signatures about a result, in their order; none in the store of an older arview."""
+        return self.decided([result_id]).get(result_id, ())
+
+    def decided(self, ids: Sequence[int]) -> dict[int, tuple[Decision, ...]]:
+        """The decisions, ticks and signatures about results, by their numbers."""
+        found: dict[int, list[Decision]] = {}
+        with self._begin() as connection:
+            if ids and sa.inspect(connection).has_table(decisions.name):
+                query = sa.select(decisions).where(decisions.c.result_id.between(min(ids), max(ids)))
+                for row in connection.execute(query.order_by(decisions.c.result_id, decisions.c.number)):
+                    found.setdefault(int(row.result_id), []).append(decision_of_row(row))
+        return {number: tuple(found[number]) for number in ids if number in found}
 
     def _insert(self, row: dict[str, Any], inspection: Inspection) -> AddedResult:
         same = sa.select(results.c.id).where(results.c.content_hash == row["content_hash"])
@@ -314,7 +359,14 @@ class HistoryStore:
                     faults.append(f"result {row.id}: its document does not have the hash {row.content_hash[:12]}…")
                 elif len(document["components"]) != of_result.get(row.id, 0):
                     faults.append(f"result {row.id}: its number of components has changed")
+        for number, entries in self.decided(range(1, 1 + self._last())).items():
+            faults += [f"result {number}: {fault}" for fault in decided_faults(entries)]
         return count, faults
+
+    def _last(self) -> int:
+        """The highest number of a result."""
+        with self._begin() as connection:
+            return int(connection.scalar(sa.select(sa.func.max(results.c.id))) or 0)
 
     # ---- connections
 
@@ -382,7 +434,7 @@ class HistoryStore:
                 raise OutputError(f"{path.parent}: cannot be created ({error.strerror or error})") from error
         elif path.is_dir():
             raise InputError(f"{path}: is a folder; expected the file of a store")
-        kind = _file_system(path)
+        kind = file_system(path)
         if kind in _NETWORK_FILE_SYSTEMS:
             raise InputError(
                 f"{path}: is on a network file system ({kind}), on which SQLite is not safe with several writers;"
@@ -407,54 +459,6 @@ class _Failure(OutputError):
 
 def _is_temporary(error: SQLAlchemyError) -> bool:
     return isinstance(error, OperationalError | DBAPIError) and any(word in str(error).lower() for word in _TEMPORARY)
-
-
-def _url(where: str) -> sa.URL:
-    if "://" not in where:
-        return sa.URL.create("sqlite", database=where)
-    try:
-        url = sa.make_url(where)
-    except ArgumentError as error:
-        raise InputError("store: is not a URL of a database; expected postgresql://user@host/database") from error
-    kind = url.get_backend_name()
-    if kind == "postgresql":
-        return url.set(drivername="postgresql+psycopg")
-    if kind == "sqlite" and url.database:
-        return url
-    raise InputError(f"store: {kind} is not supported; give a file (SQLite) or postgresql://user@host/database")
-
-
-def _prepare_sqlite(connection: Any, record: Any) -> None:
-    connection.isolation_level = None  # transactions are started below, not by the driver
-    for pragma in (
-        "journal_mode = WAL",
-        "synchronous = FULL",
-        "foreign_keys = ON",
-        f"busy_timeout = {_BUSY_S * 1000:.0f}",
-    ):
-        connection.execute(f"PRAGMA {pragma}")
-
-
-def _begin_sqlite(connection: sa.Connection) -> None:
-    # A writer takes the lock immediately; a transaction that reads first could not wait for another writer.
-    writes = connection.get_execution_options().get("arview_writes")
-    connection.exec_driver_sql("BEGIN IMMEDIATE" if writes else "BEGIN")
-
-
-def _file_system(path: Path) -> str:
-    """Type of the file system of a path as in /proc/mounts; empty when unknown."""
-    try:
-        mounts = Path("/proc/mounts").read_text(encoding="utf-8", errors="replace").splitlines()
-    except OSError:
-        return ""
-    place = path.resolve()
-    best, kind = -1, ""
-    for line in mounts:
-        _, point, name, *_ = line.split(" ")
-        folder = Path(point.replace("\\040", " "))
-        if place.is_relative_to(folder) and len(folder.parts) >= best:
-            best, kind = len(folder.parts), name
-    return kind
 
 
 def _component_row(result_id: int, one: Any) -> dict[str, Any]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from sqlalchemy import BigInteger, Column, Float, ForeignKey, Index, Integer, MetaData, String, Table, Text
 
-STORE_VERSION = 2
+STORE_VERSION = 3
 metadata = MetaData()
 _Number = BigInteger().with_variant(Integer, "sqlite")  # SQLite increments only INTEGER keys automatically
 
@@ -55,6 +55,26 @@ voids = Table(
     Column("added", String(27), nullable=False),
 )
 
+decisions = Table(
+    "arview_decisions",
+    metadata,
+    Column("result_id", _Number, ForeignKey("arview_results.id"), primary_key=True),
+    Column("number", Integer, primary_key=True),  # of the entry in its log
+    Column("kind", String(16), nullable=False),  # decision, tick, signature
+    Column("time", String(24), nullable=False),  # UTC, 2026-03-01T12:00:00.000Z
+    Column("by", Text, nullable=False),
+    Column("component", Text, nullable=False),
+    Column("is_ok", Integer),
+    Column("reason", Text, nullable=False),
+    Column("note", Text, nullable=False),
+    Column("photo", Text),
+    Column("step", Integer),
+    Column("is_done", Integer),
+    Column("inspection_sha256", String(64), nullable=False),
+    Column("previous", String(64), nullable=False),  # hash of the line before it
+    Column("sha256", String(64), nullable=False),  # hash of its line, see arview.decisions.log
+)
+
 about = Table("arview_store", metadata, Column("version", Integer, primary_key=True))
 
 _MESSAGE = "the results store is append-only"
@@ -62,7 +82,7 @@ _MESSAGE = "the results store is append-only"
 
 def guards(dialect: str) -> list[str]:
     """Statements that make changes of existing rows fail; they can be executed repeatedly."""
-    tables = (results.name, components.name, voids.name, about.name)
+    tables = (results.name, components.name, voids.name, decisions.name, about.name)
     return _sqlite_guards(tables) if dialect == "sqlite" else _postgresql_guards(tables)
 
 
@@ -78,6 +98,7 @@ def _sqlite_guards(tables: tuple[str, ...]) -> list[str]:
         results.name: "content_hash = NEW.content_hash OR id = NEW.id",
         components.name: "result_id = NEW.result_id AND name = NEW.name",
         voids.name: "result_id = NEW.result_id",
+        decisions.name: "result_id = NEW.result_id AND number = NEW.number",
         about.name: "version = NEW.version",
     }
     return statements + [

@@ -22,6 +22,7 @@ from arview.inspection.summary import overall_verdict, verdict_sentence
 from arview.measurement.cloud.distance_map import COLOR_STOPS, map_picture
 from arview.overlay.labels import by_urgency
 from arview.report import charts, explanations
+from arview.report.decisions import decisions_context
 from arview.report.evidence import ReportEvidence
 from arview.report.formatting import (
     NONE,
@@ -38,6 +39,7 @@ from arview.report.formatting import (
 )
 from arview.report.halves import repeatability_context
 from arview.report.pictures import Crop, CropOptions, Gallery, RgbImage, make_gallery, overview
+from arview.report.rework import rework_context
 from arview.report.scene import SceneOptions, make_scene, scene_json
 from arview.version import __version__
 
@@ -93,7 +95,9 @@ def build_context(evidence: ReportEvidence, options: ReportOptions, progress: Pr
     }
     context |= _components(evidence) | _findings(evidence, gallery, options)
     context |= _distance_map(evidence, options) | _budget(inspection) | _datums(inspection)
-    context |= repeatability_context(inspection)
+    context |= repeatability_context(inspection) | decisions_context(evidence)
+    progress("rework", 0, 1)
+    context |= rework_context(evidence)
     progress("photos", 0, 1)
     context |= _photos(evidence)
     if model is not None:

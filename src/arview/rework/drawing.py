@@ -18,7 +18,7 @@ from arview.rework import svg
 from arview.rework.correction import Correction, Standing, correction_of, standing_of
 from arview.rework.instructions import instructions
 from arview.rework.outline import LineOptions, ParallelView, Window, visible_lines
-from arview.rework.types import Instruction
+from arview.rework.types import Instruction, ReworkMove
 from arview.rework.words import across, targets_of, up_of
 
 
@@ -259,8 +259,11 @@ def _below(panel: _Panel, words: str) -> tuple[float, list[str]]:
     """Where a panel's scale bar and caption end, and both."""
     y = panel.y + panel.height + 5.0
     step = svg.nice(0.3 * panel.width / panel.scale)
-    caption = svg.text(panel.x, y + 4.4, words, 2.6, f'fill="{svg.MUTED}"')
-    return y + 6.0, [svg.scale_bar(panel.x, y, step, panel.scale), caption]
+    lines = [
+        svg.text(panel.x, y + 4.4 + 3.6 * k, line, 2.6, f'fill="{svg.MUTED}"')
+        for k, line in enumerate(svg.wrapped(words, panel.width, 2.6))
+    ]
+    return y + 2.4 + 3.6 * len(lines), [svg.scale_bar(panel.x, y, step, panel.scale), *lines]
 
 
 def _turn_arrow(subject: _Subject, panel: _Panel) -> list[str]:
@@ -349,6 +352,9 @@ def _side(subject: _Subject, x: float, y: float, key: str) -> tuple[float, list[
         panel = _magnified(subject, x, y)
         pieces = _framed(panel, key, _displacement(subject, panel))
         words = f"magnified {panel.scale:g} times"
+        hidden = [move.text.removeprefix("move ") for move in _moves_along_view(subject, panel)]
+        if hidden:
+            words = f"{words}; not seen: {', '.join(hidden)}"
     bottom, below = _below(panel, words)
     pieces += below
     rows = _legend(subject)
@@ -357,6 +363,17 @@ def _side(subject: _Subject, x: float, y: float, key: str) -> tuple[float, list[
         pieces.append(f'<g transform="translate({x:g} {row:.2f})">{sample}</g>')
         pieces.append(svg.text(x + 10.0, row, label, 2.6, f'fill="{svg.INK}"'))
     return bottom + 4.4 + 4.2 * len(rows), pieces
+
+
+def _moves_along_view(subject: _Subject, panel: _Panel) -> list[ReworkMove]:
+    """Moves that are too short to be seen in a panel, because they are along the view or small."""
+    moves = () if subject.instruction is None else subject.instruction.moves
+    return [move for move in moves if _drawn_length(subject, panel, move) < 0.8]
+
+
+def _drawn_length(subject: _Subject, panel: _Panel, move: ReworkMove) -> float:
+    step = subject.view.axes[:2] @ np.array(move.axis_in_model) * move.distance_mm * panel.scale
+    return float(np.hypot(*step))
 
 
 def _whole_part(subject: _Subject, x: float, y: float) -> _Panel:
@@ -396,12 +413,13 @@ def _displacement(subject: _Subject, panel: _Panel) -> list[str]:
             f'fill="none" stroke="{svg.MEASURED}" stroke-width="0.25" stroke-dasharray="0.5 0.7"/>'
         )
     pieces.append(svg.cross(measured, 1.5, svg.MEASURED))
+    hidden = _moves_along_view(subject, panel)
     here, corners, labels = measured, [measured, design], []
     for move in () if told is None else told.moves:
         step = subject.view.axes[:2] @ np.array(move.axis_in_model) * move.distance_mm * panel.scale
         there = here + step * (1.0, -1.0)
-        if float(np.hypot(*(there - here))) < 0.8:
-            continue  # it is along the view
+        if move in hidden:
+            continue
         pieces.append(svg.arrow(here, there))
         labels.append((here, there, move.text))
         corners.append(there)

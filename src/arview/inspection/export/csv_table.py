@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+from collections.abc import Mapping
 
 from arview.inspection.details import MEASURANDS
 from arview.inspection.fingerprint import fingerprint
@@ -15,12 +16,14 @@ HEADER = (
     "nominal_x_mm", "nominal_y_mm", "nominal_z_mm", "measured_x_mm", "measured_y_mm", "measured_z_mm",
     "dx_mm", "dy_mm", "dz_mm", "distance_mm", "U_mm", "k", "low_95_mm", "high_95_mm", "tolerance_mm",
     "position_diameter_mm", "tilt_deg", "twist_deg", "angle_deg", "angle_U_deg", "angle_tolerance_deg", "notes",
-    "inspection_sha256", "point",
+    "inspection_sha256", "point", "decision", "decision_reason", "decision_by", "decision_utc",
 )  # fmt: skip
 """Columns. Cells of undetermined or unmeasured values are empty."""
 
 
-def to_csv(inspection: Inspection, sha256: str | None = None) -> str:
+def to_csv(
+    inspection: Inspection, sha256: str | None = None, decided: Mapping[str, tuple[str, str, str, str]] | None = None
+) -> str:
     """The inspection as CSV with the columns of `HEADER`; lines end with CR LF.
 
     Measured values are rounded to what their U allows.
@@ -28,13 +31,15 @@ def to_csv(inspection: Inspection, sha256: str | None = None) -> str:
     Args:
         inspection: the inspection.
         sha256: fingerprint of the file it was read from; default: that of the inspection.
+        decided: decision, reason, name and time of people's decisions about components, by their names.
     """
     sha256 = sha256 or fingerprint(inspection)
     out = io.StringIO(newline="")
     writer = csv.writer(out)
     writer.writerow(HEADER)
     for component in inspection.components:
-        writer.writerow([_text(cell) for cell in (*_row(inspection, component), sha256, _point(component))])
+        person = (decided or {}).get(component.name, ("", "", "", ""))
+        writer.writerow([_text(cell) for cell in (*_row(inspection, component), sha256, _point(component), *person)])
     return out.getvalue()
 
 

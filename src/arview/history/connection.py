@@ -1,0 +1,69 @@
+"""Connections of the results store: URLs, settings of SQLite, and the file system that a store lies on."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import sqlalchemy as sa
+from sqlalchemy.exc import ArgumentError
+
+from arview.errors import InputError
+
+BUSY_S = 30.0
+"""Time that a writer waits for others; a result is written in milliseconds."""
+
+
+def store_url(where: str) -> sa.URL:
+    """The URL of a file or database.
+
+    Raises:
+        InputError: it is no URL, or of a database that is not supported.
+    """
+    if "://" not in where:
+        return sa.URL.create("sqlite", database=where)
+    try:
+        url = sa.make_url(where)
+    except ArgumentError as error:
+        raise InputError("store: is not a URL of a database; expected postgresql://user@host/database") from error
+    kind = url.get_backend_name()
+    if kind == "postgresql":
+        return url.set(drivername="postgresql+psycopg")
+    if kind == "sqlite" and url.database:
+        return url
+    raise InputError(f"store: {kind} is not supported; give a file (SQLite) or postgresql://user@host/database")
+
+
+def prepare_sqlite(connection: Any, record: Any) -> None:
+    """Settings of a new connection to SQLite: a log written ahead, on the disk before a transaction ends."""
+    connection.isolation_level = None  # transactions are started below, not by the driver
+    for pragma in (
+        "journal_mode = WAL",
+        "synchronous = FULL",
+        "foreign_keys = ON",
+        f"busy_timeout = {BUSY_S * 1000:.0f}",
+    ):
+        connection.execute(f"PRAGMA {pragma}")
+
+
+def begin_sqlite(connection: sa.Connection) -> None:
+    """Begin a transaction."""
+    # A writer takes the lock immediately; a transaction that reads first could not wait for another writer.
+    writes = connection.get_execution_options().get("arview_writes")
+    connection.exec_driver_sql("BEGIN IMMEDIATE" if writes else "BEGIN")
+
+
+def file_system(path: Path) -> str:
+    """Type of the file system of a path as in /proc/mounts; empty when unknown."""
+    try:
+        mounts = Path("/proc/mounts").read_text(encoding="utf-8", errors="replace").splitlines()
+    except OSError:
+        return ""
+    place = path.resolve()
+    best, kind = -1, ""
+    for line in mounts:
+        _, point, name, *_ = line.split(" ")
+        folder = Path(point.replace("\\040", " "))
+        if place.is_relative_to(folder) and len(folder.parts) >= best:
+            best, kind = len(folder.parts), name
+    return kind

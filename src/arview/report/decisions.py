@@ -1,0 +1,117 @@
+"""What people decided, in a report: the line beside the verdict and the section; also put into a report that is there.
+
+A decision is made after the report was written. Writing all of it again takes many seconds, so the two places lie
+between marks, and `update_report` replaces what is between them.
+"""
+
+from __future__ import annotations
+
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from markupsafe import Markup
+
+from arview.core.atomic import write_file
+from arview.decisions import Decision, RecordState, log_of, state_of_record
+from arview.decisions.table import decision_word
+from arview.errors import InputError
+from arview.inspection import load_inspection
+from arview.inspection.fingerprint import fingerprint_of_file
+from arview.report.evidence import ReportEvidence
+from arview.report.rework import embedded_picture
+
+_PARTS = ("record", "decisions")
+_THUMBNAIL_PX = 360
+
+
+def decisions_context(evidence: ReportEvidence) -> dict[str, Any]:
+    """The two parts of the page as HTML, each between its marks."""
+    return _rendered(evidence.source, state_of_record(evidence.source, evidence.inspection))
+
+
+def update_report(html: str | Path, inspection: str | Path) -> bool:
+    """Put the decisions about an inspection, as they are now, into its report.
+
+    Args:
+        html: the report, as `make_report` wrote it.
+        inspection: ``inspection.json``.
+
+    Returns:
+        True if it was updated; False if there is no such file, or it is not a report of this inspection that has a
+        place for decisions: then it has to be written again.
+
+    Raises:
+        InputError: the inspection, its log or the report cannot be read.
+        OutputError: the report cannot be written.
+    """
+    path, source = Path(html), Path(inspection)
+    if not path.is_file():
+        return False
+    try:
+        page = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: cannot be read ({error})") from error
+    if f'<span class="mono">{fingerprint_of_file(source)}</span>' not in page:
+        return False
+    made = _rendered(source, state_of_record(source, load_inspection(source)))
+    for name in _PARTS:
+        begin, end = _marks(name)
+        head, found, rest = page.partition(begin)
+        _, ended, tail = rest.partition(end)
+        if not found or not ended:
+            return False
+        page = f"{head}{made[f'{name}_html']}{tail}"
+    write_file(path, page.encode("utf-8"))
+    return True
+
+
+def _marks(name: str) -> tuple[str, str]:
+    return f"<!-- arview {name} -->", f"<!-- arview {name} end -->"
+
+
+def _rendered(source: Path, state: RecordState) -> dict[str, Any]:
+    import jinja2
+
+    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
+    text = (resources.files("arview.report") / "decisions.html").read_text(encoding="utf-8")
+    module: Any = environment.from_string(text).module
+    entries = log_of(source).entries()
+    rows = [_row(one, source) for one in entries if one.kind != "tick"]
+    made = {"record": module.record(state), "decisions": module.section(state, rows, _ticks(entries))}
+    return {f"{name}_html": Markup("").join((Markup(_marks(name)[0]), made[name], Markup(_marks(name)[1])))
+            for name in _PARTS}  # fmt: skip
+
+
+def _row(one: Decision, source: Path) -> dict[str, Any]:
+    picture = None
+    if one.photo:
+        picture = embedded_picture(source.parent / "photos" / Path(one.photo).name, _THUMBNAIL_PX)
+    return {
+        "time": one.time.strftime("%Y-%m-%d %H:%M:%S UTC"),
+        "what": "signed" if one.kind == "signature" else one.component,
+        "decision": decision_word(one),
+        "reason": one.reason,
+        "note": one.note,
+        "by": one.by,
+        "photo": one.photo or "",
+        "picture": picture,
+        "hash": one.sha256[:12],
+    }
+
+
+def _ticks(entries: tuple[Decision, ...]) -> list[dict[str, str]]:
+    """The steps of each component that are done now, and by whom."""
+    latest = {(one.component, one.step): one for one in entries if one.kind == "tick"}
+    rows: dict[str, list[Decision]] = {}
+    for one in latest.values():
+        if one.is_done:
+            rows.setdefault(one.component, []).append(one)
+    return [
+        {
+            "component": name,
+            "steps": ", ".join(str((one.step or 0) + 1) for one in sorted(done, key=lambda tick: tick.step or 0)),
+            "by": ", ".join(dict.fromkeys(one.by for one in done)),
+        }
+        for name, done in rows.items()
+    ]
