@@ -56,7 +56,7 @@ def tracked(subjects: Subjects) -> TrackedFrame:
 @pytest.mark.slow
 def test_the_part_document_lists_all_parts_and_begins_with_the_first(subjects: Subjects) -> None:
     document = with_ages(parts_document(subjects), subjects)
-    assert document["protocol"] == 2 and document["revision"] == 1
+    assert document["protocol"] == 3 and document["revision"] == 1
     first, second = document["parts"]
     assert [(one["id"], one["name"]) for one in (first, second)] == list(enumerate(NAMES))
     assert first["mark"] != second["mark"] and first["tag_color"] != second["tag_color"]

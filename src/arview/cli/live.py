@@ -120,6 +120,11 @@ withheld until the followed one is seen again, a code on the part gives the seri
 "This is the part" (key C) is pressed.
 
 \b
+A page can start the inspection of a specimen by its serial number: photos, measurement, rework, decisions. Each is
+a folder in --jobs (arview_jobs in the current folder, made with the first one); what the page has confirmed is
+there after a crash, and the next start continues measurements that are not finished.
+
+\b
 Several at once. --part may be given again, and --instances N shows N specimens of each part. Each has a name
 (the part's, with #1, #2 where several have the same), a colour and a mark of its own on labels and ghost, a line
 with its state, and its own button to confirm it (keys 1 to 9). Inspections belong to the specimens in their order.

@@ -121,6 +121,8 @@ class JobOptions:
     worker_pauses_s: tuple[float, ...] = (2.0, 10.0, 60.0)  # before a measurement that broke is started again
     worker_stop_s: float = 2.5  # time for a measurement to end in good order
     patience_s: float = 30.0  # a measurement that only waits for photos makes room for others after so long
+    idle_s: float = 900.0  # and ends after so long, until a photo comes
+    recent_s: float = 86400.0  # a walk of an earlier run that was not ended is continued if it is younger
 
 
 @dataclass(frozen=True)

@@ -19,8 +19,9 @@ and DELETE need the ``Origin`` header that browsers send. JSON is sent as ``appl
 ``GET /watch.mjpg``
     ``multipart/x-mixed-replace`` of annotated JPEGs without strip: of the station camera, or of the phone that joined
     last. At most 15 per second; 503 ``busy`` when too many screens watch.
-``GET /api/part``
-    The parts to show: see *Part*. It changes when ``revision`` does.
+``GET /api/part``, ``GET /api/part?client=CLIENT``
+    The parts to show: see *Part*. It changes when ``revision`` does. For a client that is bound to a job it holds the
+    numbers of that job; without ``client`` it never does.
 ``GET /api/model.glb?part=N``
     The CAD model of part N, without ``part`` of the first, in **mm in the model frame** (units and axes are not
     converted). Component i of the part document is node ``c<i>`` (triangles with flat normals) and node ``e<i>`` (its
@@ -59,6 +60,46 @@ and DELETE need the ``Origin`` header that browsers send. JSON is sent as ``appl
     ``{"devices": [{"name", "created", "last_used", "is_this"}]}``: the paired devices; and forget one (204), whose
     pages stop at once.
 
+Jobs
+====
+A job is the inspection of one specimen, from its first photo to the signature, in a folder at the station. Whatever is
+answered with 200 or 201 here is on the disk, and there after a crash. 404 ``no_such_job``, 507 ``disk_full`` where
+something could not be stored; then it is not confirmed.
+
+``GET /api/jobs``
+    ``{"jobs": [{"id", "part": its number here | null, "part_name", "serial", "created", "stage", "verdict" | null,
+    "photos": count, "parent" | null, "is_ended"}]}``, the oldest first.
+``POST /api/jobs`` ``{"part": N, "serial": text}``
+    201 *Job*; 200 where a job of that part and serial number is not finished: it is continued.
+``GET /api/jobs/JOB``
+    *Job*.
+``GET /api/jobs/JOB/capture``
+    ``{"cells": [{"azimuth_deg", "elevation_deg", "direction_in_model": [3]}], "distance_mm": [near, far],
+    "wanted_photos"}`` of guided capture; 503 ``loading`` while it begins.
+``POST /api/jobs/JOB/uploads`` ``{"bytes", "sha256", "source", "taken", "hint", "media_type"}``
+    Announce a photo: JPEG, PNG or HEIC. ``source``: "still" | "stream" | "upload" | "station"; ``hint`` | null:
+    ``{"cam_from_model": [16] | null, "camera": as in *Pose* | null, "quality": 0 to 1 | null}``. 201 ``{"upload",
+    "offset"}``: where to go on, above 0 for one that was begun before; 200 ``{"photo": name}`` if it is stored. 413
+    ``too_large``, 415 ``bad_type``, 429 ``too_many``.
+``GET /api/jobs/JOB/uploads/UPLOAD``
+    ``{"offset"}``, of a stored photo with ``photo``; 404 ``no_such_upload``.
+``PATCH /api/jobs/JOB/uploads/UPLOAD?offset=N``, body: the next bytes, 1 MiB at most
+    ``{"offset"}``, or after the last ones ``{"photo": name}``. 409 ``bad_offset`` with the right ``offset``; 422
+    ``bad_hash`` and ``bad_photo``: the upload is dropped, and can be begun again.
+``POST /api/jobs/JOB/take`` ``{"client"}``
+    Store the newest frame of a client that is bound to the job, with its pose: 201 ``{"photo"}``. 409 ``other_job``,
+    ``no_such_frame``.
+``POST /api/jobs/JOB/end``, ``POST /api/jobs/JOB/reopen``
+    No more photos come, or more come after all: *Job*. A photo that was announced before still counts after the end.
+``POST /api/jobs/JOB/recheck`` ``{"components": [names]}``
+    201 *Job* that measures these components again; 409 ``not_done`` before the first measurement.
+``POST /api/jobs/JOB/decisions`` ``{"component", "is_ok", "reason", "note", "by", "photo": name | null}``, ``…/ticks``
+``{"component", "step": index, "is_done", "by"}``, ``…/sign`` ``{"by", "note"}``
+    201, the entry of the log, see `arview.decisions`; 409 ``not_done`` while there is no result.
+``GET /api/jobs/JOB/report.html``, ``inspection.json``, ``decisions.csv``, ``photos/NAME``, ``rework/COMPONENT.svg``,
+``rework/PICTURE``
+    Files of the job; a picture by the name that an instruction has for it.
+
 WebRTC
 ======
 The page creates one peer connection without ICE servers and gathers all ICE candidates before it sends the offer. The
@@ -78,14 +119,16 @@ heights are even.
 *Control* can change the mode at any time; a few frames of the previous mode may still arrive.
 
 The data channel carries JSON texts from server to page: a *Pose* for every tracked frame (dropped, never queued, when
-the channel is congested), and a *Status* every second and whenever its revision, notices or recording change. Messages
-that the page sends there are ignored.
+the channel is congested), and a *Status* every second and whenever its revision, notices, recording or job change. The
+page may send ``{"type": "motion", "gyro_rad_s": rate of turn}`` there, ten times a second, for guided capture (with
+jpeg: ``&gyro=`` in the address of its frames); other messages are ignored.
 
 Messages
 ========
 **Several parts.** *Part* and *Pose* describe one part. Where several parts, or specimens of one, are shown, they
 describe the first one, and have ``parts`` in addition: a list of all of them, each with its number ``id`` (from 0) and
-the keys that are marked ``(part)`` below. This is version 2 of the protocol; a page of version 1 shows the first part.
+the keys that are marked ``(part)`` below. This came with version 2 of the protocol; a page of version 1 shows the first
+part. Version 3 has jobs; a page of version 2 works as before.
 
 Join::
 
@@ -111,7 +154,12 @@ Pose::
      (all)
      "camera": {"width", "height", "fx", "fy", "cx", "cy", "dist": [5]},   intrinsics for the picture on the page
      "wait_ms": arrival to start of tracking, "track_ms": tracking, "server_ms": arrival to this response,
-     "dropped": frames dropped by the feed so far, "scale": received over sent size, 1 when unscaled}
+     "dropped": frames dropped by the feed so far, "scale": received over sent size, 1 when unscaled,
+     "capture": {"job", "take_id", "takes": take a photo now, once for each take_id, "text", "reason": why not now,
+                 "progress": 0 to 1, "is_enough", "photos", "distance": "near" | "good" | "far",
+                 "cells": a letter for each, "0" open, "1" filled, "2" wanted,
+                 "components": [{"index", "photos", "U_mm" | null, "is_enough", "text"}] when changed, or every second}}
+                                                                                 with guided capture only
 
 Status::
 
@@ -121,6 +169,9 @@ Status::
               "unreadable": frames without a readable stamp or JPEG, "width": px | null, "height": px | null} | null,
      "notices": [{"code": see NOTICE_CODES, "level": "info" | "warning" | "error", "text": one line}],
      "recording": {"is_on": bool, "seconds": s, "finished": [N, …] in this run},
+     "job": {"id", "serial", "part": number, "stage": "collecting" | "measuring" | "done" | "failed", "text",
+             "state": state.json, see `WalkState`, "photos": count, "uploads": count, "revision",
+             "worker": "none" | "waiting" | "running" | "failed"} | null,     the client's
      "clients": count, "max_clients": count}
 
 Control, every key and every key of ``style`` may be absent::
@@ -135,11 +186,25 @@ Control, every key and every key of ``style`` may be absent::
      "screen": {"width", "height": px of the screen that the picture fills, "density": px for each CSS px} | null,
                                   annotated video is made no larger, with labels that can be read there
      "hold": frame id | null,     keep this frame for a snapshot; 404 no_such_frame when it is no longer kept
+     "job": JOB | null,           show the numbers of this job, and nothing measured of another one; 404, 409 other_part
+     "capture": JOB | null,       guided capture for the job that is shown
      "record": bool}
+
+Job::
+
+    {"id", "part": number | null, "part_name", "serial", "model_hash", "created", "camera", "parent", "components",
+     "state": state.json, "is_ended", "photos": [names], "uploads": [{"upload", "bytes", "offset"}], "worker": as above,
+     "faults": [texts], damaged lines of the list of photos,
+     "inspection": {"created", "verdict", "sentence", "note", "components": [{"name", "verdict", "value_text",
+                    "detail_text", "distance_mm", "uncertainty_mm"}]} | null,
+     "rework": [instructions, see `arview.rework.instruction_document`],
+     "decisions": [entries of the log, ticks included], "signed": entry | null: a signature that holds,
+     "record": {"sentence", "is_released", …} | null, see `arview.decisions.state_document`,
+     "rechecks": [ids], "before_after": [{"name", "before_mm", "after_mm", "verdict_before", "verdict_after"}]}
 
 Part::
 
-    {"protocol": 2, "revision": N, "state": "loading" | "ready" | "failed", "text": text,
+    {"protocol": 3, "revision": N, "state": "loading" | "ready" | "failed", "text": text,
      "source": "phone" | "station", "source_name": text, "wanted": {"width", "height", "fps"},     for a phone's camera
      (part)
      "name": of the specimen, "mark": sign of its labels, "tag_color": "#rrggbb" of that sign,     only in ``parts``
@@ -148,7 +213,8 @@ Part::
      "components": [{"name", "color": "#rrggbb", "anchor_in_model": [3], "rank": by urgency | null,
                      "verdict": "pass" | "fail" | "undecided" | "measured" | "not_measured" | null, null: not inspected,
                      "verdict_text": "PASS" | null, "verdict_color": "#rrggbb", "missing": bool,
-                     "value_text", "detail_text", "distance_mm" | null, "uncertainty_mm" | null, "tolerance_mm" | null,
+                     "value_text": "measuring" while a job has no number, "detail_text",
+                     "distance_mm" | null, "uncertainty_mm" | null, "tolerance_mm" | null,
                      "displacement_mm": [3, null where undetermined]}],
      "inspection": {"part", "serial", "created": ISO 8601 UTC, "age_s", "note", "method"} | null,
      "arrow_scale": exaggeration of the displacement arrows}
@@ -170,8 +236,8 @@ from typing import Final, Literal
 Transport = Literal["webrtc", "jpeg"]
 ViewMode = Literal["poses", "video"]
 
-PROTOCOL: Final = 2
-"""Version of the protocol: 2 since there may be several parts."""
+PROTOCOL: Final = 3
+"""Version of the protocol: 2 since there may be several parts, 3 with jobs."""
 COOKIE: Final = "arview"
 ANSWER_HEADER: Final = "X-Arview-Answer"
 CHANNEL: Final = "arview"
@@ -184,9 +250,12 @@ NOTICE_CODES: Final = {
     "inspection_none": "no inspection was given: ghosts have no verdicts",
     "inspection_future": "the inspection was made in the future: a clock is wrong",
     "inspection_old": "the inspection is older than the maximum age",
+    "inspection_rough": "the numbers of the job are provisional: from its first photos",
     "inspection_serial": "the inspection has another serial number than the part",
     "inspection_model": "the changed inspection file belongs to another model; the last valid one is shown",
     "inspection_unreadable": "the changed inspection file cannot be read; the last valid one is shown",
+    "job_damaged": "a line of the job's list of photos was cut off or damaged; its photo was never confirmed",
+    "job_failed": "the photos of the job could not be measured",
     "source_reconnecting": "the station camera is disconnected; the server reconnects",
     "source_frozen": "the station camera delivers the same picture or none",
     "size_refused": "the camera file does not match the aspect ratio of the frames",

@@ -28,9 +28,10 @@ from arview.live.security.refusals import Refusal
 from arview.live.server.annotated_png import annotated_png
 from arview.live.server.clients import Client
 from arview.live.server.hub import Hub
+from arview.live.server.jobs_api import JobHandlers
 from arview.live.server.station_api import StationHandlers, keep_snapshot
 from arview.live.server.workers import StuckError
-from arview.live.stream.documents import Document, pose_document
+from arview.live.stream.documents import Document
 from arview.live.stream.feed import TrackedFrame
 from arview.live.stream.frames import DecodedFrame, IncomingFrame, from_jpeg
 from arview.live.transport.motion_jpeg import MotionJpeg
@@ -67,6 +68,7 @@ def make_app(hub: Hub, access: Access, connections: ConnectionTable | None = Non
         Route(f"{client}/snapshot.png", handlers.annotated_png),
         Route(f"{client}/snapshots", handlers.keep_snapshot, methods=["POST"]),
         *StationHandlers(hub).routes,
+        *JobHandlers(hub).routes,
     ]
     handlers_of_errors = {**refusal_handlers(), HTTPException: _http_error, StuckError: _stuck}
     app = Starlette(routes=routes, exception_handlers=handlers_of_errors)
@@ -105,8 +107,8 @@ class Handlers:
         return MotionJpeg(self._hub, self._hub.options, lambda: self._hub.is_paired(device))
 
     async def part(self, request: Request) -> Response:
-        """The *Part* document."""
-        return _json_response(await self._hub.part())
+        """The *Part* document, for a client that of its job."""
+        return _json_response(await self._hub.part(request.query_params.get("client")))
 
     async def model(self, request: Request) -> Response:
         """The CAD model of a part as GLB."""
@@ -166,6 +168,8 @@ class Handlers:
             except InputError as error:
                 client.feed.unreadable += 1
                 raise Refusal(400, "bad_request", str(error)) from error
+            if (gyro := _decimal(request.query_params.get("gyro", ""))) is not None:
+                client.turned(gyro)
             frame = DecodedFrame(frame_id, image, turns)
             client.feed.put(IncomingFrame(lambda: frame, arrived_s))
             return await self._answer(client, await self._tracked(client, frame))
@@ -194,7 +198,7 @@ class Handlers:
             client.seen()
         if client.mode == "video":
             return await self._answer(client, tracked)
-        return _jpeg_response(await asyncio.to_thread(lambda: tracked.jpeg), tracked)
+        return _jpeg_response(await asyncio.to_thread(lambda: tracked.jpeg), client.document(tracked))
 
     async def annotated_png(self, request: Request) -> Response:
         """A snapshot: the PNG of a frame with its overlay."""
@@ -215,7 +219,9 @@ class Handlers:
         tracked = client.feed.newest if wants_newest else client.find(_number(request, "id", FRAME_IDS))
         if tracked is None:
             raise Refusal(404, "no_such_frame", "that frame is no longer kept")
-        return await asyncio.to_thread(annotated_png, subjects, client.annotator, tracked)
+        if client.binding is not None:
+            subjects = client.binding.view.subjects
+        return await asyncio.to_thread(annotated_png, subjects, client.annotator, client.shown(tracked))
 
     async def _tracked(self, client: Client, frame: DecodedFrame) -> TrackedFrame:
         """Wait until this frame has been tracked."""
@@ -239,10 +245,9 @@ class Handlers:
     async def _answer(self, client: Client, tracked: TrackedFrame) -> Response:
         """The response to a page without WebRTC for a tracked frame."""
         if client.mode == "poses":
-            return _json_response(pose_document(tracked, time.monotonic()))
-        return _jpeg_response(
-            await asyncio.to_thread(lambda: client.annotator.draw(tracked, screen=client.screen).jpeg), tracked
-        )
+            return _json_response(client.document(tracked))
+        picture = await asyncio.to_thread(lambda: client.draw(tracked).jpeg)
+        return _jpeg_response(picture, client.document(tracked))
 
 
 def refusal_handlers() -> dict[type[Exception], ErrorHandler]:
@@ -281,9 +286,9 @@ def static_files(package: str) -> dict[str, tuple[bytes, str]]:
     return files
 
 
-def _jpeg_response(jpeg: bytes, tracked: TrackedFrame) -> Response:
+def _jpeg_response(jpeg: bytes, pose: Document) -> Response:
     """A JPEG with its *Pose* in the header."""
-    answer = json.dumps(pose_document(tracked, time.monotonic()), allow_nan=False)
+    answer = json.dumps(pose, allow_nan=False)
     return Response(jpeg, media_type="image/jpeg", headers={ANSWER_HEADER: answer})
 
 
@@ -295,6 +300,14 @@ def _number(request: Request, name: str, end: int, default: int | None = None) -
     if text is None or not (text.isascii() and text.isdecimal() and len(text) < 10 and int(text) < end):
         raise Refusal(400, "bad_request", f"{name}: expected an integer from 0 to {end - 1}")
     return int(text)
+
+
+def _decimal(text: str) -> float | None:
+    """A number of the query; None where it is none."""
+    try:
+        return float(text) if len(text) < 30 else None
+    except ValueError:
+        return None
 
 
 def _json_response(document: Document, status: int = 200) -> Response:

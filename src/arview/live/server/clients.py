@@ -10,14 +10,18 @@ from dataclasses import replace
 from typing import Any, get_args
 
 from arview.errors import InputError
+from arview.live.jobs.desk import Binding
 from arview.live.protocol import FRAME_IDS, Transport, ViewMode
 from arview.live.security.refusals import Refusal
-from arview.live.stream.annotator import FrameAnnotator, Screen
+from arview.live.stream.annotator import AnnotatedFrame, FrameAnnotator, Screen
+from arview.live.stream.documents import Document, pose_document
 from arview.live.stream.feed import Feed, TrackedFrame
 from arview.live.stream.newest import AsyncNewestSlot
 from arview.live.stream.subject import OverlayStyle
 from arview.live.transport.webrtc import Connection
 
+MAX_JOB_NAME = 200
+"""Letters of the name of a job."""
 _STYLE_TYPES: dict[str, tuple[type, ...]] = {
     "ghost": (bool,),
     "edges": (str,),
@@ -41,6 +45,7 @@ class Client:
         screen: where the page shows annotated video; None: it is not told.
         connection: the WebRTC connection, if that is the transport.
         inbox: newest frame of the feed, for the transport without WebRTC.
+        binding: job that the page shows, if any.
         held: frame that is kept for a snapshot.
         is_busy: whether a request for a frame is being served.
         joined_s, seen_s: monotonic times of joining and of the last request.
@@ -60,6 +65,7 @@ class Client:
         self.screen: Screen | None = None
         self.connection: Connection | None = None
         self.inbox: AsyncNewestSlot[TrackedFrame] = AsyncNewestSlot(asyncio.get_running_loop())
+        self.binding: Binding | None = None
         self.held: TrackedFrame | None = None
         self.is_busy = False
         self.joined_s = self.seen_s = time.monotonic()
@@ -72,6 +78,33 @@ class Client:
         self.feed.unlisten(self.inbox.put)
         if self.connection is not None:
             await self.connection.close()
+
+    def shown(self, tracked: TrackedFrame) -> TrackedFrame:
+        """A tracked frame with what this page shows of it: the labels of its job."""
+        return tracked if self.binding is None else self.binding.view.shown(tracked)
+
+    def draw(self, tracked: TrackedFrame) -> AnnotatedFrame:
+        """A tracked frame with the overlay of this page, for its screen; not in the event loop."""
+        return self.annotator.draw(self.shown(tracked), screen=self.screen)
+
+    def document(self, tracked: TrackedFrame) -> Document:
+        """*Pose* of a tracked frame for this page."""
+        document = pose_document(self.shown(tracked), time.monotonic())
+        guiding = None if self.binding is None else self.binding.guiding
+        if guiding is not None and (advice := guiding.document()) is not None:
+            document["capture"] = advice
+        return document
+
+    def told(self, message: Document) -> None:
+        """Take a message of the page on the data channel."""
+        if message.get("type") == "motion":
+            self.turned(message.get("gyro_rad_s"))
+
+    def turned(self, gyro_rad_s: Any) -> None:
+        """Note how fast the device turns, for guided capture; anything but a number of rad/s is ignored."""
+        is_number = isinstance(gyro_rad_s, int | float) and not isinstance(gyro_rad_s, bool)
+        if self.binding is not None and self.binding.guiding is not None and is_number and 0.0 <= gyro_rad_s < 100.0:
+            self.binding.guiding.gyro_rad_s = float(gyro_rad_s)
 
     def find(self, frame_id: int) -> TrackedFrame | None:
         """The tracked frame with this id, if it is still kept."""
@@ -124,6 +157,9 @@ def check_control(control: dict[str, Any], style: OverlayStyle, components: Sequ
     def is_part(value: Any) -> bool:
         return type(value) is int and 0 <= value < len(components)
 
+    def is_name(value: Any) -> bool:
+        return isinstance(value, str) and 0 < len(value) <= MAX_JOB_NAME
+
     for key, value in control.items():
         is_good = {
             "mode": isinstance(value, str) and value in get_args(ViewMode),
@@ -132,6 +168,8 @@ def check_control(control: dict[str, Any], style: OverlayStyle, components: Sequ
             "confirm": (isinstance(value, bool) and (len(components) == 1 or not value)) or is_part(value),
             "record": isinstance(value, bool),
             "screen": value is None or screen_of(value) is not None,
+            "job": value is None or is_name(value),
+            "capture": value is None or is_name(value),
             "hold": value is None or (type(value) is int and 0 <= value < FRAME_IDS),
         }.get(key, False)
         if not is_good:

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from arview.errors import ArviewError, InputError
+from arview.live.jobs.desk import Binding, JobDesk, JobView
 from arview.live.options import LiveOptions
 from arview.live.protocol import Transport, ViewMode
 from arview.live.security.devices import Devices
@@ -49,6 +50,7 @@ class Hub:
 
     Attributes:
         subjects, recordings: None while the parts are being loaded.
+        desk: the jobs that pages start.
         clients: the pages that take part, by name.
         watchers: number of screens that only watch.
     """
@@ -57,6 +59,7 @@ class Hub:
         self.options, self._addresses, self.devices = options, addresses, devices
         self.subjects: Subjects | None = None
         self.recordings: Recordings | None = None
+        self.desk = JobDesk(options.jobs)
         self.clients: dict[str, Client] = {}
         self.watchers = 0
         self._loading = loading_document(options, "loading", "the part is being loaded")
@@ -67,6 +70,7 @@ class Hub:
         self._recorded: set[Path] = set()
         self._ticker: asyncio.Task[None] | None = None
         self._adopting: asyncio.Task[None] | None = None
+        self._resuming: asyncio.Task[None] | None = None
         self._joining = 0
         self._leaving: set[asyncio.Future[bool]] = set()
 
@@ -86,6 +90,7 @@ class Hub:
                 self.recordings.start(feed, annotator, self.options.record)
         self._ticker = asyncio.ensure_future(self._run_ticker())
         self._adopting = asyncio.ensure_future(self._adopt())
+        self._resuming = asyncio.ensure_future(in_daemon_thread(lambda: self.desk.begin(subjects)))
 
     def ready(self) -> tuple[Subjects, Recordings]:
         """The parts and the recordings.
@@ -97,10 +102,14 @@ class Hub:
             raise Refusal(503, "loading", "the part is being loaded; wait a moment", {"Retry-After": "1"})
         return self.subjects, self.recordings
 
-    async def part(self) -> Document:
-        """The *Part* document."""
+    async def part(self, client: str | None = None) -> Document:
+        """The *Part* document, for a client that is bound to a job with the numbers of that job."""
         if self.subjects is None:
             return self._loading
+        bound = self.clients.get(client or "")
+        if bound is not None and bound.binding is not None:
+            subjects = bound.binding.view.subjects
+            return with_ages(await asyncio.to_thread(parts_document, subjects), subjects)
         revision = self.subjects.revision
         if self._part is None or self._part[0] != revision:
             self._part = revision, await asyncio.to_thread(parts_document, self.subjects)
@@ -157,6 +166,7 @@ class Hub:
         if client is None:
             return False
         logger.info("a page left (%d of %d)", len(self.clients), self.options.max_clients)
+        self._free(client)
         await self._release(client)
         return True
 
@@ -197,6 +207,7 @@ class Hub:
             held = client.find(request["hold"])
             if held is None:
                 raise Refusal(404, "no_such_frame", "that frame is no longer kept")
+        await self._bind(client, request)
         client.annotator.style = style
         client.mode = request.get("mode", client.mode)
         client.screen = screen_of(request["screen"]) if "screen" in request else client.screen
@@ -210,6 +221,57 @@ class Hub:
         elif request.get("record") is False:
             await asyncio.to_thread(recordings.stop, client.feed)
 
+    async def _bind(self, client: Client, request: dict[str, Any]) -> None:
+        """Bind a client to a job, or free it, and begin or end guided capture.
+
+        Raises:
+            Refusal: there is no such job, or it is of another part; then nothing is changed.
+        """
+        before = client.binding
+        wanted = request.get("job", before.view.job.id if before is not None else None)
+        guided = request.get("capture", wanted if before is not None and before.guiding is not None else None)
+        if guided is not None and guided != wanted:
+            raise Refusal(400, "bad_control", "control: capture is not the job that is shown")
+        if before is None or wanted != before.view.job.id:
+            view = None if wanted is None else await asyncio.to_thread(self.desk.view, wanted)
+            self._free(client)
+            if view is not None:
+                self._show(client, view)
+        binding = client.binding
+        if binding is not None and (guided is None) != (binding.guiding is None):
+            if binding.guiding is not None:
+                client.feed.unlisten(binding.guiding.listen)
+                self.desk.unguide(binding.guiding, binding.view)
+                binding.guiding = None
+            else:
+                binding.guiding = self.desk.guide(binding.view)
+                client.feed.listen(binding.guiding.listen)
+
+    def _show(self, client: Client, view: JobView) -> None:
+        """Let a client show a job: a phone's stream is then of that specimen, a station's only for this page."""
+        client.binding = Binding(view)
+        if self._shared is None:
+            client.feed.show(view.subjects)
+            client.feed.reset()
+            client.annotator.show(view.subjects)
+        else:
+            style, client.annotator = client.annotator.style, FrameAnnotator(view.subjects)
+            client.annotator.style = style
+
+    def _free(self, client: Client) -> None:
+        """Let a client show what it showed before it was bound to a job."""
+        binding, client.binding = client.binding, None
+        if binding is None or self.subjects is None:
+            return
+        if binding.guiding is not None:
+            client.feed.unlisten(binding.guiding.listen)
+            self.desk.unguide(binding.guiding, binding.view)
+        if self._shared is None:
+            client.feed.show(self.subjects)
+            client.annotator.show(self.subjects)
+        else:
+            client.annotator = self._shared[1]
+
     # --- status ------------------------------------------------------------------------------
 
     def watched(self) -> tuple[Feed, FrameAnnotator] | None:
@@ -221,7 +283,8 @@ class Hub:
 
     def status(self, client: Client | None) -> Document:
         """The *Status* document of a client, or without one."""
-        shared = self._shared
+        shared, binding = self._shared, client.binding if client is not None else None
+        subjects = self.subjects if binding is None else binding.view.subjects
         feed = client.feed if client is not None else shared[0] if shared is not None else None
         described = None
         if feed is not None:
@@ -231,23 +294,25 @@ class Hub:
         recorder = self.recordings.of(feed) if self.recordings is not None and feed is not None else None
         return {
             "type": "status",
-            "revision": self.subjects.revision if self.subjects is not None else 0,
+            "revision": subjects.revision if subjects is not None else 0,
             "mode": client.mode if client is not None else None,
             "style": style_document(client.annotator.style) if client is not None else None,
             "feed": described,
-            "notices": notice_documents(self._notices(feed)),
+            "notices": notice_documents(self._notices(feed, subjects)),
             "recording": {
                 "is_on": recorder is not None,
                 "seconds": round(recorder.seconds, 1) if recorder is not None else 0.0,
                 "finished": self.recordings.finished if self.recordings is not None else [],
             },
+            "job": None if binding is None else binding.view.status,
             "clients": len(self.clients),
             "max_clients": self.options.max_clients,
         }
 
     async def close(self) -> None:
         """Remove all clients, close the station camera and finish the files."""
-        for task in (self._ticker, self._adopting):
+        finish_workers = self.desk.close()
+        for task in (self._ticker, self._adopting, self._resuming):
             if task is not None:
                 task.cancel()
                 with suppress(asyncio.CancelledError):
@@ -261,6 +326,7 @@ class Hub:
         if self._shared is not None:
             closing.append(in_daemon_thread(self._shared[0].close))
         await self._within(asyncio.gather(*closing, return_exceptions=True), self.options.closing_timeout_s)
+        await self._within(in_daemon_thread(finish_workers), 2.0 * self.options.closing_timeout_s)
 
     async def _within(self, work: Awaitable[object], timeout_s: float) -> None:
         """Wait for work, but not for long."""
@@ -277,10 +343,7 @@ class Hub:
             self._leaving.add(leaving)
             leaving.add_done_callback(self._leaving.discard)
 
-        connection = Connection(
-            client.feed, client.annotator, lambda: client.mode, self._addresses, ended, self.options.webrtc,
-            screen=lambda: client.screen,
-        )  # fmt: skip
+        connection = Connection(client.feed, client, self._addresses, ended, self.options.webrtc)
         client.connection = connection
         try:
             return await asyncio.wait_for(connection.answer(sdp), self.options.webrtc.offer_timeout_s)
@@ -310,8 +373,8 @@ class Hub:
         self._recorded.add(target)
         recordings.start(client.feed, client.annotator, target)
 
-    def _notices(self, feed: Feed | None) -> list[Notice]:
-        notices = self.subjects.notices() if self.subjects is not None else []
+    def _notices(self, feed: Feed | None, subjects: Subjects | None) -> list[Notice]:
+        notices = subjects.notices() if subjects is not None else []
         if self._station is not None:
             notices = [*notices, *self._station.notices()]
         if feed is not None:
@@ -351,6 +414,7 @@ class Hub:
             self.devices.refresh()
         if self.recordings is not None:
             self.recordings.check_space()
+        self.desk.look_up()
 
     async def _adopt(self) -> None:
         """List earlier recordings, and recover those that a crash has cut off."""
@@ -386,7 +450,13 @@ class Hub:
         if client.connection is None or not client.connection.is_connected:
             return
         status = self.status(client)
-        news = (status["revision"], status["notices"], status["recording"]["is_on"], status["recording"]["finished"])
+        news = (
+            status["revision"],
+            status["notices"],
+            status["recording"]["is_on"],
+            status["recording"]["finished"],
+            status["job"],
+        )
         if news != client.last_status[0] or now_s - client.last_status[1] >= self.options.status_interval_s:
             client.last_status = news, now_s
             client.connection.send(status)

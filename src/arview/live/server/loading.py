@@ -51,6 +51,7 @@ def load_subjects(
             inspections than specimens.
     """
     parts = [part for path in part_paths for part in [load_part(path, unit)] * instances]
+    paths = [path for path in part_paths for _ in range(instances)]
     inspections = [*options.inspections, *[None] * (len(parts) - len(options.inspections))]
     if len(inspections) > len(parts):
         raise InputError(
@@ -72,8 +73,8 @@ def load_subjects(
 
     subjects = Subjects(
         [
-            Subject(part, views_of(part), options, name, inspection)
-            for part, name, inspection in zip(parts, names, inspections, strict=True)
+            Subject(part, views_of(part), options, name, inspection, path)
+            for part, name, inspection, path in zip(parts, names, inspections, paths, strict=True)
         ]
     )
     if options.is_phone:

@@ -132,6 +132,11 @@ class FrameAnnotator:
         finally:
             lock.release()
 
+    def show(self, subjects: Subjects) -> None:
+        """Draw other parts, or the same ones with other numbers, from the next frame on."""
+        self._subjects = subjects
+        self._renderers = OrderedDict()
+
     def close(self) -> None:
         """Release pictures and renderers."""
         self._renderers = OrderedDict()

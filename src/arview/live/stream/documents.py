@@ -99,7 +99,7 @@ def evidence_document(pose: Pose, subject: Subject | None) -> Document:
             {
                 "index": index,
                 "evidence": str(evidence),
-                "value": text.value,
+                "value": text.value or (subject.pending_text if deviation is None else ""),
                 "word": text.word,
                 "notes": list(text.notes),
                 "color": _hex(text.rgb),
@@ -187,7 +187,7 @@ def part_document(subject: Subject) -> Document:
                 "color": _hex(tuple(round(255 * value) for value in component.color)),
                 "anchor_in_model": anchor_in_model(component, topology(component)).tolist(),
                 "rank": ranks.get(component.name),
-                **_deviation_document(found),
+                **_deviation_document(found, subject.pending_text),
             }
         )
     return {
@@ -242,10 +242,11 @@ def style_document(style: OverlayStyle) -> Document:
     }
 
 
-def _deviation_document(found: ComponentDeviation | None) -> Document:
+def _deviation_document(found: ComponentDeviation | None, pending_text: str = "") -> Document:
     if found is None:
         names = ("verdict", "verdict_text", "verdict_color", "distance_mm", "uncertainty_mm", "tolerance_mm")
-        return {**dict.fromkeys(names), "displacement_mm": None, "missing": False, "value_text": "", "detail_text": ""}
+        empty = {"displacement_mm": None, "missing": False, "value_text": pending_text, "detail_text": ""}
+        return {**dict.fromkeys(names), **empty}
     plain = OverlayOptions()
     return {
         "verdict": str(found.verdict),

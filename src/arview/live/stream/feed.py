@@ -138,6 +138,10 @@ class Feed:
         """The user says that a part in view is the one to which its labels belong, from the next frame on."""
         self._wanted.append(("confirm", part))
 
+    def show(self, subjects: Subjects) -> None:
+        """Track the same parts as specimens with other serial numbers and inspections, from the next frame on."""
+        self._subjects = subjects
+
     def find(self, frame_id: int) -> TrackedFrame | None:
         """The tracked frame with this id, if it is still kept."""
         return next((one for one in reversed(tuple(self._kept)) if one.frame.frame_id == frame_id), None)
@@ -272,7 +276,7 @@ class Feed:
             self._prepare(self._session)
         if self._view is not None and self._view.is_resampling:
             picture = self._view.picture(np.ascontiguousarray(frame.image), frame.frame_id)
-            frame = replace(frame, image=picture)
+            frame = replace(frame, image=picture, original=frame.image)
         self._serial += 1
         if self._session is None:
             reason = self._refused.text if self._refused else ""

@@ -30,6 +30,7 @@ class DecodedFrame:
         quarter_turns_clockwise: rotation that the browser, or the reader, applied to the picture of the sensor.
         scale: received size over the size in which it was taken; 1 when the frame was not scaled in transit.
         unsquared_size: width and height in px before pixels were made square; None where they were square.
+        original: the picture of a wide lens before it was undistorted; None where it was not.
     """
 
     frame_id: int
@@ -37,6 +38,7 @@ class DecodedFrame:
     quarter_turns_clockwise: int = 0
     scale: float = 1.0
     unsquared_size: tuple[int, int] | None = None
+    original: Image | None = None
 
 
 @dataclass(frozen=True)

@@ -67,12 +67,7 @@ class InspectionFile:
     def notices(self, now: datetime | None = None) -> list[Notice]:
         """The notices about the inspection at this time (default: now)."""
         notices = [self._fault] if self._fault else []
-        age_s = self.inspection.age_s(now or datetime.now(UTC))
-        if age_s < -CLOCK_SLACK_S:
-            text = f"measured in the future, by {_lead_text(-age_s)}: check the clocks of this machine and of the other"
-            notices.append(Notice("inspection_future", "warning", text))
-        if self._max_age_s is not None and age_s > self._max_age_s:
-            notices.append(Notice("inspection_old", "warning", f"measured {age_text(age_s)}: measure again"))
+        notices += age_notices(self.inspection, self._max_age_s, now)
         measured = self.inspection.serial
         if self._serial and measured != self._serial:
             other = f"of {measured}" if measured else "without a serial number"
@@ -88,6 +83,17 @@ class InspectionFile:
         except OSError:
             return None
         return stat.st_mtime_ns, stat.st_size, stat.st_ino
+
+
+def age_notices(inspection: Inspection, max_age_s: float | None, now: datetime | None = None) -> list[Notice]:
+    """The notices about the age of an inspection at this time (default: now): too old, or from the future."""
+    age_s = inspection.age_s(now or datetime.now(UTC))
+    if age_s < -CLOCK_SLACK_S:
+        text = f"measured in the future, by {_lead_text(-age_s)}: check the clocks of this machine and of the other"
+        return [Notice("inspection_future", "warning", text)]
+    if max_age_s is not None and age_s > max_age_s:
+        return [Notice("inspection_old", "warning", f"measured {age_text(age_s)}: measure again")]
+    return []
 
 
 def _lead_text(lead_s: float) -> str:

@@ -67,10 +67,12 @@ class Subject:
         options: options of the server.
         name: that tells it from the others, see `Pose.instance`; empty for the only one.
         inspection_path: of its inspection, or None.
+        path: of the part file or CAD file, or None.
 
     Attributes:
         serial: serial number of the part at the station, or None.
         revision: number of the part document, increased with each new inspection.
+        pending_text: what stands in place of a value that is still being measured; empty where nothing is.
 
     Raises:
         InputError, MismatchError: the inspection cannot be read or belongs to another model, or the guide view does
@@ -84,8 +86,9 @@ class Subject:
         options: LiveOptions,
         name: str = "",
         inspection_path: Path | None = None,
+        path: str | None = None,
     ) -> None:
-        self.part, self.views, self.options, self.name = part, views, options, name
+        self.part, self.views, self.options, self.name, self.path = part, views, options, name, path
         self.serial = options.serial or part.serial
         self.revision = 1
         self._lock = threading.Lock()
@@ -94,6 +97,8 @@ class Subject:
             self._file = InspectionFile(inspection_path, part.model, self.serial, options.max_age_s)
         if options.guide is not None:
             guide_pose(options.guide, part, views.view_range, guess_camera(options.width, options.height))
+
+    pending_text = ""
 
     @cached_property
     def label_options(self) -> OverlayOptions:

@@ -11,7 +11,7 @@ from collections.abc import Callable, Coroutine, Sequence
 from contextlib import suppress
 from fractions import Fraction
 from functools import partial
-from typing import Any
+from typing import Any, Protocol
 
 import aiortc.codecs.h264
 import aiortc.codecs.vpx
@@ -22,8 +22,8 @@ from av.video.frame import VideoFrame
 from arview.errors import InputError
 from arview.live.options import WebrtcOptions
 from arview.live.protocol import CHANNEL, ViewMode
-from arview.live.stream.annotator import FrameAnnotator, Screen
-from arview.live.stream.documents import Document, pose_document
+from arview.live.stream.annotator import AnnotatedFrame
+from arview.live.stream.documents import Document
 from arview.live.stream.feed import Feed, TrackedFrame
 from arview.live.stream.frames import IncomingFrame, from_stamped
 from arview.live.stream.newest import AsyncNewestSlot
@@ -31,6 +31,8 @@ from arview.live.stream.stamp import stamped
 from arview.live.transport.receiving import reduce_latency, restrict_candidates
 
 _CLOCK_HZ = 90_000
+MAX_MESSAGE = 1000
+"""Letters of a message of a page."""
 _BITRATES = {"DEFAULT_BITRATE": 2_500_000, "MIN_BITRATE": 500_000, "MAX_BITRATE": 8_000_000}
 """Bitrates of aiortc's encoders, bit/s. Its own ones are for video calls, in which labels would not be readable."""
 _KBITS = "x-google-min-bitrate=800;x-google-start-bitrate=4000;x-google-max-bitrate=10000"
@@ -44,28 +46,42 @@ def raise_bitrates() -> None:
             setattr(codec, name, value)
 
 
+class Viewer(Protocol):
+    """The page at the other end of a connection.
+
+    Attributes:
+        mode: what it wants to receive.
+    """
+
+    mode: ViewMode
+
+    def draw(self, tracked: TrackedFrame, /) -> AnnotatedFrame:
+        """A tracked frame with the overlay of the page."""
+        ...
+
+    def document(self, tracked: TrackedFrame, /) -> Document:
+        """*Pose* of a tracked frame for the page."""
+        ...
+
+    def told(self, message: Document, /) -> None:
+        """Take a message of the page."""
+        ...
+
+
 class OutgoingVideoTrack(MediaStreamTrack):
     """The track that sends the newest frames of a feed, stamped.
 
     Args:
         feed: the feed.
-        annotator: draws the overlay on its frames.
-        mode: called for each frame. In mode "video" annotated frames are sent, in mode "poses" the plain frames of a
-            station camera; a phone has its own frames.
-        screen: called for each annotated frame; returns where it is shown, if that is known.
+        viewer: who sees it. In mode "video" annotated frames are sent, in mode "poses" the plain frames of a station
+            camera; a phone has its own frames.
     """
 
     kind = "video"
 
-    def __init__(
-        self,
-        feed: Feed,
-        annotator: FrameAnnotator,
-        mode: Callable[[], ViewMode],
-        screen: Callable[[], Screen | None] = lambda: None,
-    ) -> None:
+    def __init__(self, feed: Feed, viewer: Viewer) -> None:
         super().__init__()
-        self._feed, self._annotator, self._mode, self._screen = feed, annotator, mode, screen
+        self._feed, self._viewer = feed, viewer
         self._inbox: AsyncNewestSlot[TrackedFrame] = AsyncNewestSlot(asyncio.get_running_loop())
         self._began_s = time.monotonic()
         self._ticks = -1
@@ -77,7 +93,7 @@ class OutgoingVideoTrack(MediaStreamTrack):
             tracked = await self._inbox.take()
             if self.readyState != "live":
                 raise MediaStreamError
-            mode = self._mode()
+            mode = self._viewer.mode
             if mode == "poses" and self._feed.kind == "phone":
                 continue
             frame = await asyncio.to_thread(self._frame, tracked, mode)
@@ -91,9 +107,7 @@ class OutgoingVideoTrack(MediaStreamTrack):
         super().stop()
 
     def _frame(self, tracked: TrackedFrame, mode: ViewMode) -> VideoFrame:
-        image = tracked.frame.image
-        if mode == "video":
-            image = self._annotator.draw(tracked, screen=self._screen()).image
+        image = self._viewer.draw(tracked).image if mode == "video" else tracked.frame.image
         height, width = image.shape[0] // 2 * 2, image.shape[1] // 2 * 2
         return VideoFrame.from_ndarray(stamped(image[:height, :width], tracked.frame.frame_id), format="rgb24")
 
@@ -103,12 +117,10 @@ class Connection:
 
     Args:
         feed: receives the camera frames of the page, or provides those of the station camera.
-        annotator: annotator of that feed.
-        mode: called for each frame; returns what the page wants to receive.
+        viewer: the page.
         addresses: addresses at which ICE candidates are offered.
         on_end: called once when the connection has failed or the page has closed it.
         options: limits.
-        screen: called for each annotated frame; returns where it is shown, if that is known.
 
     Attributes:
         is_connected: whether the connection is established.
@@ -118,14 +130,12 @@ class Connection:
     def __init__(
         self,
         feed: Feed,
-        annotator: FrameAnnotator,
-        mode: Callable[[], ViewMode],
+        viewer: Viewer,
         addresses: Sequence[str],
         on_end: Callable[[], None],
         options: WebrtcOptions | None = None,
-        screen: Callable[[], Screen | None] = lambda: None,
     ) -> None:
-        self._feed, self._annotator, self._mode, self._screen = feed, annotator, mode, screen
+        self._feed, self._viewer = feed, viewer
         self._addresses, self._on_end = addresses, on_end
         self._options = options or WebrtcOptions()
         self._peer = RTCPeerConnection(RTCConfiguration(iceServers=[]))
@@ -153,7 +163,7 @@ class Connection:
             videos = [one for one in self._peer.getTransceivers() if one.kind == "video"]
             if len(videos) != 1 or self._peer.sctp is None:
                 raise InputError("the offer needs one video transceiver and one data channel")
-            self._track = OutgoingVideoTrack(self._feed, self._annotator, self._mode, self._screen)
+            self._track = OutgoingVideoTrack(self._feed, self._viewer)
             self._peer.addTrack(self._track)
             restrict_candidates(self._peer, self._addresses)
             await self._peer.setLocalDescription(await self._peer.createAnswer())
@@ -196,6 +206,18 @@ class Connection:
     def _on_channel(self, channel: Any) -> None:
         if channel.label == CHANNEL and self._channel is None:
             self._channel = channel
+            channel.on("message", self._on_message)
+
+    def _on_message(self, message: Any) -> None:
+        """Take a message of the page; what is no small JSON object is ignored."""
+        if not isinstance(message, str) or len(message) > MAX_MESSAGE:
+            return
+        try:
+            document = json.loads(message)
+        except (ValueError, RecursionError):
+            return
+        if isinstance(document, dict):
+            self._viewer.told(document)
 
     def _on_state(self) -> None:
         self.is_connected = self._peer.connectionState == "connected"
@@ -214,7 +236,7 @@ class Connection:
     async def _send_poses(self) -> None:
         while True:
             tracked = await self._inbox.take()
-            self.send(pose_document(tracked, time.monotonic()))
+            self.send(self._viewer.document(tracked))
 
     def _start(self, work: Coroutine[Any, Any, None]) -> None:
         task = asyncio.ensure_future(work)
