@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from arview.cad import load_part
 from arview.studio.document import StudioDocument
 from arview.studio.server import StudioServer
 from helpers.live_client import Http
@@ -47,10 +48,10 @@ class Studio:
 
 
 @contextmanager
-def running_studio(path: Path) -> Iterator[Studio]:
-    """The studio of a part or CAD file, at a free port."""
+def running_studio(path: Path, *others: Path) -> Iterator[Studio]:
+    """The studio of a part or CAD file, at a free port, beside parts that it might be taken for."""
     document = StudioDocument(path)
-    server = StudioServer(document, 0)
+    server = StudioServer(document, 0, [load_part(other) for other in others])
     ready, before = threading.Event(), set(threading.enumerate())
     thread = threading.Thread(target=lambda: asyncio.run(server.serve(ready.set)), daemon=True)
     thread.start()

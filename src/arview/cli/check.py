@@ -25,12 +25,15 @@ class _CheckCommand(Command):
     epilog="""\b
 Examples:
   arview check part.toml
-  arview check housing.stl --unit mm --camera fov:65""",
+  arview check housing.stl --unit mm --camera fov:65
+  arview check left.step --against right.step""",
 )
 @click.argument("part")
 @UNIT
 @click.option("--camera", "camera_spec", metavar="CAMERA", help="Camera file or fov:DEG, for sizes in pixels.")
-def check(part: str, unit: str | None, camera_spec: str | None) -> None:
+@click.option("--against", "others", multiple=True, metavar="PART",
+              help="Another part it might be taken for; may be repeated.")  # fmt: skip
+def check(part: str, unit: str | None, camera_spec: str | None, others: tuple[str, ...]) -> None:
     """Print what PART consists of, and what will be hard about finding and tracking it.
 
     Symmetric or ambiguous shapes, components too small to be seen from the declared distance, thin or open
@@ -39,8 +42,10 @@ def check(part: str, unit: str | None, camera_spec: str | None) -> None:
     from arview.cad import check_part, load_part
     from arview.camera.read import load_camera
     from arview.guideviews.findings import uniqueness_findings
+    from arview.guideviews.look_alikes import compare_parts
 
     loaded = load_part(part, unit)
+    beside = [load_part(other, unit) for other in others]
     camera = None
     if camera_spec is not None:
         size = (1280, 720) if camera_spec.startswith("fov:") else (None, None)
@@ -49,4 +54,5 @@ def check(part: str, unit: str | None, camera_spec: str | None) -> None:
         findings = uniqueness_findings(loaded.model, loaded.effective_view_range)
     except InputError:  # a range of views that cannot be used, which the check of the part explains
         findings = []
+    findings += [one.finding() for one in compare_parts(loaded, beside)]
     click.echo(check_part(loaded, camera).with_findings(findings).format())

@@ -104,6 +104,7 @@ def guideviews(
 Examples:
   arview studio bracket.step
   arview studio part.toml --port 8500
+  arview studio left.step --against right.step
 
 \b
 Opens a page for the browser of this machine; nothing leaves it. There roles, colours and tolerances are set in the
@@ -117,9 +118,11 @@ the commands check, guideviews and annotate.""",
 @click.option(
     "--port", type=click.IntRange(0, 65535), default=8460, show_default=True, help="Port of the page; 0: any."
 )
+@click.option("--against", "others", multiple=True, metavar="PART",
+              help="Another part it might be taken for; may be repeated.")  # fmt: skip
 @UNIT
 @click.option("--no-browser", is_flag=True, help="Print the address, open no browser.")
-def studio(part: str, port: int, unit: str | None, no_browser: bool) -> None:
+def studio(part: str, port: int, others: tuple[str, ...], unit: str | None, no_browser: bool) -> None:
     """Set up PART, a CAD or part file, on a local page."""
     import asyncio
     import os
@@ -130,10 +133,11 @@ def studio(part: str, port: int, unit: str | None, no_browser: bool) -> None:
     from arview.cli.live import require_extra
 
     require_extra()
+    from arview.cad import load_part
     from arview.studio.document import StudioDocument
     from arview.studio.server import StudioServer
 
-    server = StudioServer(StudioDocument(part, unit), port)
+    server = StudioServer(StudioDocument(part, unit), port, [load_part(other, unit) for other in others])
 
     async def serve() -> None:
         for number in (signal.SIGINT, signal.SIGTERM):

@@ -111,6 +111,17 @@ def assess(views: GuideViewSet) -> Uniqueness:
     )
 
 
+def likeness_between(views: GuideViewSet, others: GuideViewSet) -> tuple[Array, NDArray[np.int64]]:
+    """Largest likeness (N,) of each view to a view of another part, at any roll and size, and the index of that one."""
+    spectra, other_spectra = (
+        np.moveaxis(np.fft.rfft(np.stack([_descriptor(view, one.diameter_mm) for view in one]), axis=1), 1, 0)
+        for one in (views, others)
+    )
+    conjugates = other_spectra.conj().transpose(0, 2, 1)
+    likeness = np.fft.irfft(spectra @ conjugates, n=_ANGLES, axis=0).max(axis=0)
+    return likeness.max(axis=1), likeness.argmax(axis=1).astype(np.int64)
+
+
 def _assessed_views(views: GuideViewSet) -> NDArray[np.int64]:
     """Indices of the views by which a set is assessed."""
     cosine = assessed_directions(views.view_range) @ views.directions.T

@@ -25,7 +25,7 @@ from __future__ import annotations
 
 import asyncio
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +36,7 @@ from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 from starlette.types import ASGIApp, Receive, Scope, Send
 
+from arview.cad.part import Part
 from arview.errors import ArviewError
 from arview.live.options import LiveOptions
 from arview.live.security.access import Access, Gate
@@ -73,9 +74,9 @@ TRIAL_SUFFIXES = {
 """Endings of the names of pictures and clips that can be tried."""
 
 
-def make_app(document: StudioDocument, access: Access) -> ASGIApp:
+def make_app(document: StudioDocument, access: Access, others: Sequence[Part] = ()) -> ASGIApp:
     """The application, for those with the token of this run."""
-    handlers = StudioHandlers(document)
+    handlers = StudioHandlers(document, others)
     routes = [
         Route("/", handlers.index),
         Route("/static/{name:path}", handlers.static),
@@ -118,9 +119,9 @@ class _Ended:
 class StudioHandlers:
     """The handlers of the routes; what takes time is done in threads."""
 
-    def __init__(self, document: StudioDocument) -> None:
+    def __init__(self, document: StudioDocument, others: Sequence[Part]) -> None:
         self._document = document
-        self._views, self._trials = Assessments(), Trials()
+        self._views, self._trials = Assessments(others), Trials()
         self._files = static_files("arview.studio")
 
     async def index(self, request: Request) -> Response:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -14,6 +14,7 @@ from arview.cad.model import Model, make_model
 from arview.cad.part import Part
 from arview.cad.view_range import ViewRange
 from arview.guideviews.findings import assessed_guide_views, azimuths_deg, confusable_pair, elevations_deg
+from arview.guideviews.look_alikes import PartLikeness, compare_parts
 from arview.guideviews.sheet import view_tile
 from arview.guideviews.uniqueness import CONFUSABLE_LIKENESS, PLAIN_LINES, Uniqueness, assess
 from arview.guideviews.views import GuideViewSet
@@ -32,10 +33,12 @@ class Assessment:
     Attributes:
         views: those by which the part is assessed.
         unique: what was found.
+        look_alikes: the part beside each of the parts that it might be taken for.
     """
 
     views: GuideViewSet
     unique: Uniqueness
+    look_alikes: tuple[PartLikeness, ...] = ()
 
     def describe(self) -> dict[str, Any]:
         """The document of the page: verdict, shares, and a row for each view."""
@@ -52,6 +55,7 @@ class Assessment:
             "plain_share": float(np.mean([word == "plain" for word in weak])),
             "confusable_share": float(np.mean([word == "alike" for word in weak])),
             "most_alike": confusable_pair(views, unique),
+            "look_alikes": [vars(one) for one in self.look_alikes],
             "views": [
                 {
                     "direction": direction,
@@ -76,9 +80,14 @@ class Assessment:
 
 
 class Assessments:
-    """Assesses the part in a thread of its own, and keeps the last assessment until the part is another one."""
+    """Assesses the part in a thread of its own, and keeps the last assessment until the part is another one.
 
-    def __init__(self) -> None:
+    Args:
+        others: parts that it might be taken for.
+    """
+
+    def __init__(self, others: Sequence[Part] = ()) -> None:
+        self._others = list(others)
         self._lock = threading.Lock()
         self._key: tuple[str, ViewRange] | None = None
         self._done: Assessment | None = None
@@ -112,6 +121,7 @@ class Assessments:
         done, error = None, ""
         try:
             done = assessed(part.model, key[1])
+            done = replace(done, look_alikes=tuple(compare_parts(part, self._others, done.views)))
         except Exception as failure:  # told on the page
             error = str(failure)
         with self._lock:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
+from arview.cad.part import Part
 from arview.live.security.access import Access
 from arview.live.security.addresses import LOOPBACK
 from arview.live.server.live_server import open_endpoint
@@ -25,15 +26,16 @@ class StudioServer:
     Args:
         document: the part.
         port: of the page; 0 stands for any free one.
+        others: parts that it might be taken for.
 
     Raises:
         InputError: the port is not available.
     """
 
-    def __init__(self, document: StudioDocument, port: int) -> None:
+    def __init__(self, document: StudioDocument, port: int, others: Sequence[Part] = ()) -> None:
         self._endpoint = open_endpoint(None, port, is_plain=True)
         self.access = Access.to([LOOPBACK, "localhost"], self._endpoint.port, is_secure=False)
-        self._server = UvicornServer(make_app(document, self.access), self._endpoint.listener)
+        self._server = UvicornServer(make_app(document, self.access, others), self._endpoint.listener)
 
     @property
     def port(self) -> int:

@@ -31,7 +31,8 @@ export class ViewsTab {
     }
     const { is_sufficient: isFine } = views;
     this.verdict.className = `verdict-box ${isFine ? "pass" : "fail"}`;
-    this.verdict.replaceChildren(icon(isFine ? "pass" : "fail"), make("div", {}, make("b", {}, isFine ? "sufficient" : "insufficient"), make("div", {}, reasonOf(views))));
+    this.verdict.replaceChildren(icon(isFine ? "pass" : "fail"), make("div", {}, make("b", {}, isFine ? "sufficient" : "insufficient"), make("div", {}, reasonOf(views)),
+      ...(views.look_alikes ?? []).map((one) => make("p", { class: one.is_confusable ? "warning" : "" }, `${one.is_confusable ? "⚠ " : ""}${one.text}`))));
     this.advice.replaceChildren();
     this.help.hidden = Boolean(views.error);
     this.#facts();
