@@ -6,7 +6,7 @@ SAMPLE := samples/plate
 # A worker for each core; each test file goes to one worker, in the order of tests/conftest.py.
 PARALLEL := -n auto --dist loadgroup --no-loadscope-reorder
 
-.PHONY: help demo test test-fast check docs guideviews bench evaluate soak clean
+.PHONY: help demo test test-fast check docs guideviews bench evaluate soak screens clean
 
 help:
 	@echo "make demo      inspect the sample plate: report and annotated video in out/demo"
@@ -18,6 +18,7 @@ help:
 	@echo "make bench     measure speed: out/bench.json"
 	@echo "make evaluate  measure accuracy on the recorded sequences: out/evaluation.json, out/evaluation.md"
 	@echo "make soak      run the live server for ten minutes, and check its memory and the age of frames"
+	@echo "make screens   photograph the live page in every state and look: out/screens"
 	@echo "make clean     remove what these targets made, except .venv"
 
 $(READY): pyproject.toml $(wildcard requirements.lock) tools/setup
@@ -56,6 +57,9 @@ evaluate: $(READY)
 
 soak: $(READY)
 	.venv/bin/python tools/benchmarks/soak.py
+
+screens: $(READY)
+	.venv/bin/python tools/screens.py -o out/screens
 
 clean:
 	rm -rf out dist .pytest_cache .mypy_cache .ruff_cache

@@ -10,18 +10,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from arview.camera import Camera
-from arview.live.stream.subject import Subject
-from arview.video import VideoSink
 from helpers import live_browser
-from helpers.live_client import Running, running
-from helpers.live_sample import INSPECTION, loader, options
-from helpers.told_session import Told
+from helpers.live_client import Running
+from helpers.told_station import told_station
 from helpers.web_driver import Browser, ChromiumPage, firefox, until, webkit
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
-WIDTH, HEIGHT, FPS = 640, 360, 5
+WIDTH, HEIGHT = 640, 360
 SCREENS = [(360, 640), (390, 844), (430, 932)]
 MIN_TOUCH_PX = 44
 SETTLED_S = 0.6
@@ -52,21 +48,8 @@ return {
 @pytest.fixture(scope="module")
 def station(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
     """A station camera that plays the sample."""
-    path = tmp_path_factory.mktemp("station") / "station.mp4"
-    images = live_browser.frames(WIDTH, HEIGHT)
-    with VideoSink(path, WIDTH, HEIGHT, FPS) as sink:
-        for count, k in enumerate(live_browser.there_and_back()):
-            sink.write(images[k], count / FPS)
-    start = Subject.session
-
-    def session(subject: Subject, camera: Camera) -> Any:
-        return Told(start(subject, camera), [one.name for one in subject.part.model.components])
-
-    chosen = options(source=str(path), inspection=INSPECTION)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Subject, "session", session)
-        with running(chosen, loader(chosen)) as server:
-            yield server
+    with told_station(tmp_path_factory.mktemp("station"), WIDTH, HEIGHT) as server:
+        yield server
 
 
 @pytest.fixture(scope="module", params=["chromium", "firefox", "webkit"])

@@ -135,7 +135,7 @@ export class Stage {
   draw({ frame, pose, guide, isAnnotated }) {
     this.isChanged = false;
     if (!frame) return this.labelBoxes.hide();
-    this.#lay(frame, pose);
+    this.#lay(frame, pose, isAnnotated);
     const isReady = this.ghost?.components.length > 0 && this.components !== null;
     const ownPose = isReady && pose && !isAnnotated && frame.width === pose.lens.width && frame.height === pose.lens.height ? pose : null;
     const ownGuide = isReady && guide && frame.width === guide.lens.width ? guide : null;
@@ -217,11 +217,12 @@ export class Stage {
   }
 
   /** Position the canvas for the picture of this frame. */
-  #lay(frame, pose) {
+  #lay(frame, pose, isAnnotated) {
     const { whole, free } = (this.#areas ??= this.#measured());
     const fit = (area) => Math.min(area.width / frame.width, area.height / frame.height);
-    const isRoomy = this.viewport.isManual || this.isFollowing || fit(free) >= ROOMY * fit(whole), area = isRoomy ? free : whole;
-    const { left, top, scale } = this.viewport.place(frame, area, this.isFollowing ? this.#boxOf(pose, frame) : null, !this.calm.matches);
+    const isFollowing = this.isFollowing && !isAnnotated; // labels that the station has drawn must stay in view
+    const isRoomy = this.viewport.isManual || isFollowing || fit(free) >= ROOMY * fit(whole), area = isRoomy ? free : whole;
+    const { left, top, scale } = this.viewport.place(frame, area, isFollowing ? this.#boxOf(pose, frame) : null, !this.calm.matches);
     const width = frame.width * scale, height = frame.height * scale, old = this.#place;
     // Of the picture only this is seen: the bars cover the rest.
     this.#areas.seen = {

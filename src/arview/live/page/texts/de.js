@@ -54,7 +54,7 @@ export default {
   "message.busy": "Ausgelastet",
   "message.busy.text": "{text}. Diese Seite macht weiter, sobald Platz ist.",
   "message.denied": "Dieser Link gilt nicht mehr",
-  "message.denied.text": "arview wurde neu gestartet: Scannen Sie den Code an der Station noch einmal",
+  "message.denied.text": "dieses Gerät ist nicht mit der Station gekoppelt: Scannen Sie den Code, den sie zeigt",
   "message.lost": "Verbindung verloren, neuer Versuch",
   "message.loading": "Lädt",
   "message.failed": "Das Teil kann nicht gezeigt werden",

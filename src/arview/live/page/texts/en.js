@@ -54,7 +54,7 @@ export default {
   "message.busy": "Busy",
   "message.busy.text": "{text}. This page continues as soon as there is room.",
   "message.denied": "This link is no longer valid",
-  "message.denied.text": "arview was restarted: scan the code at the station again",
+  "message.denied.text": "this device is not paired with the station: scan the code that it shows",
   "message.lost": "Connection lost, retrying",
   "message.loading": "Loading",
   "message.failed": "The part cannot be shown",

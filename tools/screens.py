@@ -1,0 +1,307 @@
+#!/usr/bin/env python3
+"""Photographs the live page in every state, look and size, and puts the pictures on contact sheets.
+
+    tools/screens.py [--only WORD …] [-o out/screens]
+
+A station plays the sample's clip; what the page gets is changed where a state needs it. It takes some minutes, and
+needs Chromium and Playwright, as the tests do.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+
+from arview.pose import ComponentPresence, Identity, Presence, TrackingState, Visibility
+from helpers import live_browser
+from helpers.live_client import Running
+from helpers.page import until
+from helpers.told_session import TOLD
+from helpers.told_station import told_station
+
+PHONE, SMALL, TALL = (390, 844), (360, 640), (430, 932)
+LANDSCAPE, DESK = (844, 390), (1280, 800)
+FILM_SIZE = 1280, 720
+TILE_PX, COLUMNS, ROWS, CAPTION_PX = 330, 5, 2, 22
+TRACKED = "document.body.dataset.state === 'tracked'"
+LABELLED = f"{TRACKED} && document.querySelectorAll('#labels .label:not(.off)').length > 0"
+
+NO_WEBRTC = "delete globalThis.RTCPeerConnection"
+SERIAL = "void import('/static/serial.js').then((one) => one.askSerial({ frame: () => null, seen: () => 'BP-0417' }))"
+STALE_MS = 14_000
+
+Act = Callable[[Any], None]
+
+
+@dataclass(frozen=True)
+class Shot:
+    """A state of the page to photograph.
+
+    Attributes:
+        name: of the picture.
+        size: of the screen, CSS px.
+        told: what the tracker says, as in `Told`.
+        before: what is done before the page is opened: routes, scripts.
+        ready: expression that is true once the state is reached.
+        after: what is done then.
+        settings: of the browser's context, such as its locale.
+    """
+
+    name: str
+    size: tuple[int, int] = PHONE
+    told: dict[str, dict[str, Any]] = field(default_factory=dict)
+    before: Act = lambda page: None
+    ready: str = LABELLED
+    after: Act = lambda page: None
+    settings: dict[str, Any] = field(default_factory=dict)
+
+
+def answers(path: str, document: Any, status: int = 200) -> Act:
+    """Answer requests for a path with this document."""
+    return lambda page: page.route(f"**{path}", lambda route: route.fulfill(status=status, json=document))
+
+
+def changes(path: str, change: Callable[[dict[str, Any]], None]) -> Act:
+    """Change the documents that the station gives for a path."""
+
+    def act(page: Any) -> None:
+        def handle(route: Any) -> None:
+            document = route.fetch().json()
+            change(document)
+            route.fulfill(json=document)
+
+        page.route(f"**{path}", handle)
+
+    return act
+
+
+def script(text: str) -> Act:
+    return lambda page: page.add_init_script(text)
+
+
+def evaluate(text: str) -> Act:
+    return lambda page: page.evaluate(text)
+
+
+def click(selector: str) -> Act:
+    return lambda page: page.locator(selector).evaluate("element => element.click()")
+
+
+def both(*acts: Act) -> Act:
+    def act(page: Any) -> None:
+        for one in acts:
+            one(page)
+            page.wait_for_timeout(250)
+
+    return act
+
+
+def refused(name: str) -> Act:
+    """A phone whose browser refuses the camera with this error."""
+    wanted = f"navigator.mediaDevices.getUserMedia = () => Promise.reject(new DOMException('', '{name}'))"
+    return both(script(wanted), changes("/api/part", lambda part: part.update(source="phone")))
+
+
+def appearance(theme: str, size: str = "normal") -> Act:
+    return script(f"localStorage.setItem('arview-look', JSON.stringify({{theme: '{theme}', size: '{size}'}}))")
+
+
+def notice(code: str, level: str, text: str) -> Act:
+    """One more notice of the station; a page without WebRTC asks for them."""
+
+    def add(status: dict[str, Any]) -> None:
+        status.setdefault("notices", []).insert(0, {"code": code, "level": level, "text": text})
+
+    return both(
+        script("localStorage; delete globalThis.RTCPeerConnection"), changes("/status", add), changes("/control", add)
+    )
+
+
+def files() -> Act:
+    now = datetime.now(UTC)
+
+    def moment(hours: float) -> str:
+        return (now - timedelta(hours=hours)).isoformat().replace("+00:00", "Z")
+
+    def job(name: str, hours: float, stage: str, verdict: str | None, photos: int, **more: Any) -> dict[str, Any]:
+        about = {"id": name, "part": "bracket_plate", "serial": "BP-0417", "created": moment(hours), "parent": None}
+        return {**about, "stage": stage, "verdict": verdict, "photos": photos, **more}
+
+    films = [
+        {"number": 2, "name": "bracket_plate_20270111T101500.mp4", "bytes": 48_200_000, "seconds": 73.2},
+        {"number": 1, "name": "bracket_plate_20270110T083000.mp4", "bytes": 9_100_000, "seconds": None},
+    ]
+    recordings = [
+        {**film, "created": moment(hours), "is_recovered": hours > 1}
+        for film, hours in zip(films, (1, 26), strict=True)
+    ]
+    jobs = [
+        job("j2", 2, "measuring", None, 14, serial="BP-0418"), job("j1", 20, "done", "fail", 24),
+        job("j1r", 19, "done", "pass", 6, parent="j1"),
+    ]  # fmt: skip
+    return both(
+        answers("/api/recordings", {"recordings": recordings}), answers("/api/jobs", {"jobs": jobs}),
+        answers("/api/snapshots", {"snapshots": []}),
+    )  # fmt: skip
+
+
+def in_the_future(part: dict[str, Any]) -> None:
+    made = datetime.now(UTC) + timedelta(days=2)
+    part["inspection"] |= {"created": made.isoformat().replace("+00:00", "Z"), "age_s": -172_800}
+
+
+def shots() -> list[Shot]:
+    moved = np.eye(4)
+    moved[1, 3] = 35.0
+    absent = ComponentPresence(Presence.MISSING, Visibility.VISIBLE, 0.01, 9, 40.0)
+    displaced = ComponentPresence(Presence.DISPLACED, Visibility.VISIBLE, 0.01, 9, 40.0, moved)
+    unposed = {"cam_from_model": None, "covariance": None}
+    unsure = {"identity": Identity.UNCONFIRMED, "identity_reason": "two plates are in view"}
+    unsure_pose = {"state": TrackingState.CRITICAL, "reason": "part of the plate is hidden"}
+    searching = {"more": {"state": TrackingState.SEARCHING, **unposed}}
+    styles = (("light", "normal", PHONE), ("contrast", "normal", PHONE), ("dark", "largest", SMALL))
+    german = {"locale": "de-DE"}
+    busy = answers("/api/clients", {"error": "busy", "message": "busy: 4 of 4 pages take part"}, 503)
+    loading = {
+        "protocol": 2,
+        "revision": 0,
+        "state": "loading",
+        "text": "guide views of bracket_plate: 40 %",
+        "source": "station",
+    }
+    denied = answers("/api/part", {"error": "no_token", "message": "the token is missing"}, 403)
+    message = "!document.querySelector('#message').hidden"
+    state = "document.body.dataset.state === '{}'"
+    side = "document.querySelector('#open-{}')"
+    parts, view = (evaluate(f"{side.format(name)}.click()") for name in ("parts", "view"))
+    stale = both(lambda page: page.context.set_offline(True), lambda page: page.wait_for_timeout(STALE_MS))
+    card = both(parts, click('.components button[data-name="nut_1"]'), click("#close-side"))
+    video = both(click("#transports input[value=video]"), lambda page: page.wait_for_timeout(6000))
+    open_files = both(parts, click('[data-tab="files"]'))
+    return [
+        Shot("loading", before=answers("/api/part", loading), ready=message),
+        Shot("searching", told=searching, ready=state.format("searching")),
+        Shot("tracked"),
+        Shot("missing", told={"components": {"post_1": absent, "bracket_1": displaced, "boss_1": ComponentPresence()}}),
+        Shot("withheld", told={"more": unsure}, ready="!document.querySelector('#labels .banner').hidden"),
+        Shot("critical", told={"more": unsure_pose}, ready=state.format("critical")),
+        Shot("lost", told={"more": {"state": TrackingState.LOST, **unposed}}, ready=state.format("lost")),
+        Shot("stale", before=script(NO_WEBRTC), after=stale),
+        Shot("stale parts", before=script(NO_WEBRTC), after=both(parts, stale)),
+        Shot("no camera", before=refused("NotFoundError"), ready=message),
+        Shot("camera denied", before=refused("NotAllowedError"), ready=message),
+        Shot("busy", before=busy, ready=message),
+        Shot("denied", before=denied, ready=message),
+        Shot("no WebRTC", before=script(NO_WEBRTC), after=click("#notices .notice")),
+        Shot("future", before=changes("/api/part", in_the_future), after=click("#notices .notice")),
+        Shot("low disk", before=notice("disk_low", "warning", "1.2 GB are left for the recording: about 4 minutes")),
+        Shot("frozen", after=click("#freeze")),
+        Shot("parts", after=parts),
+        Shot("view", after=view),
+        Shot("files", before=files(), after=open_files),
+        Shot("card", after=card),
+        Shot("serial", after=evaluate(SERIAL)),
+        Shot("job", after=click("#open-job")),
+        Shot("zoomed, arrows", after=both(*[click("#zoom-in")] * 3)),
+        Shot("station video", after=video),
+        *(Shot(f"{theme}, {name}", before=both(appearance(theme, size), files()), after=after, size=shape)
+          for theme, size, shape in styles
+          for name, after in (("tracked", lambda page: None), ("parts", parts), ("view", view), ("files", open_files))),
+        Shot("German", settings=german),
+        Shot("German, view", settings=german, after=view, size=TALL),
+        Shot("German, small", settings=german, size=SMALL),
+        Shot("small", size=SMALL),
+        Shot("tall", size=TALL),
+        Shot("landscape", size=LANDSCAPE),
+        Shot("landscape, small", size=SMALL[::-1]),
+        Shot("landscape, parts", size=LANDSCAPE, after=parts),
+        Shot("landscape, card", size=LANDSCAPE, after=card),
+        Shot("desk", size=DESK),
+        Shot("desk, light", size=DESK, before=appearance("light")),
+        Shot("desk, contrast", size=DESK, before=appearance("contrast")),
+        Shot("recording", after=both(click("#record"), lambda page: page.wait_for_timeout(2500))),
+    ]  # fmt: skip
+
+
+def photograph(chromium: Any, server: Running, shot: Shot, path: Path) -> list[str]:
+    """Photograph a state; returns the errors that the page reported."""
+    TOLD.update({"components": {}, "more": {}, **shot.told})
+    width, height = shot.size
+    given = {"locale": "en-US", "color_scheme": "dark", **shot.settings}
+    context = chromium.new_context(viewport={"width": width, "height": height}, device_scale_factor=1, **given)
+    page = context.new_page()
+    errors: list[str] = []
+    page.on("pageerror", lambda error: errors.append(str(error)))
+    try:
+        shot.before(page)
+        page.goto(f"http://127.0.0.1:{server.port}/?token={server.token}")
+        until(page, shot.ready)
+        page.wait_for_timeout(1500)
+        shot.after(page)
+        page.wait_for_timeout(700)
+        page.screenshot(path=path)
+    finally:
+        context.close()
+        TOLD.update({"components": {}, "more": {}})
+    return errors
+
+
+def sheets(pictures: list[tuple[str, Path]], folder: Path) -> list[Path]:
+    """Contact sheets of named pictures."""
+    height = round(TILE_PX * PHONE[1] / PHONE[0])
+    font = ImageFont.load_default(16)
+    made = []
+    for first in range(0, len(pictures), COLUMNS * ROWS):
+        sheet = Image.new("RGB", (COLUMNS * TILE_PX, ROWS * (height + CAPTION_PX)), (70, 74, 82))
+        for i, (name, path) in enumerate(pictures[first : first + COLUMNS * ROWS]):
+            picture = Image.open(path).convert("RGB")
+            picture.thumbnail((TILE_PX - 8, height))
+            left, top = i % COLUMNS * TILE_PX + 4, i // COLUMNS * (height + CAPTION_PX)
+            ImageDraw.Draw(sheet).text((left, top + 2), name, (255, 255, 255), font=font)
+            sheet.paste(picture, (left, top + CAPTION_PX))
+        made.append(folder / f"sheet-{len(made) + 1}.jpg")
+        sheet.save(made[-1], quality=88)
+    return made
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description="Photograph the live page in every state.")
+    parser.add_argument("--only", nargs="*", default=[], metavar="WORD", help="states with one of these words")
+    parser.add_argument("-o", "--output", type=Path, default=Path("out/screens"), help="folder of the pictures")
+    chosen = parser.parse_args()
+    wanted = [one for one in shots() if not chosen.only or any(word in one.name for word in chosen.only)]
+    chosen.output.mkdir(parents=True, exist_ok=True)
+    pictures, failures = [], 0
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        told_station(Path(folder), *FILM_SIZE, has_numbers=False) as server,
+        live_browser.browser(None) as chromium,
+    ):
+        for shot in wanted:
+            path = chosen.output / f"{shot.name.replace(', ', '_').replace(' ', '_')}.png"
+            try:
+                errors = photograph(chromium, server, shot, path)
+            except Exception as error:
+                errors = [str(error).splitlines()[0]]
+            else:
+                pictures.append((shot.name, path))
+            failures += bool(errors)
+            print(f"{shot.name}: {'; '.join(errors) or 'photographed'}", flush=True)
+    for path in sheets(pictures, chosen.output):
+        print(path)
+    return 1 if failures else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
