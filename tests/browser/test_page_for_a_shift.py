@@ -23,6 +23,7 @@ pytestmark = [pytest.mark.browser, pytest.mark.slow]
 WIDTH, HEIGHT = 640, 360
 PHONE = {"width": 390, "height": 844}
 ROOMY = {"width": 680, "height": 640}
+LOADED = "document.querySelector('.components button') !== null"
 TRACKED = "window.drawn?.pose?.state === 'tracked'"
 NO_WEBRTC = "delete globalThis.RTCPeerConnection"
 NAMED_ROLES = {"button", "switch", "radio", "slider", "combobox", "textbox", "link", "progressbar", "meter", "checkbox"}
@@ -117,7 +118,7 @@ def test_every_control_has_a_name_and_german_is_complete(chromium: Any, station:
     names: dict[str, dict[str, set[str]]] = {}
     for locale in ("en-US", "de-AT"):
         with opened(chromium, station, locale=locale, viewport=PHONE) as page:
-            until(page, TRACKED)
+            until(page, LOADED)
             found = names[locale[:2]] = {"picture": {name for _, name in controls(page)}}
             assert page.evaluate("document.documentElement.lang") == locale[:2]
             for section in ("job", "parts", "view", "files"):
@@ -170,7 +171,7 @@ def test_looks_follow_the_device_and_can_be_read(
 
 def test_a_chosen_look_stays(chromium: Any, station: Running) -> None:
     with opened(chromium, station, color_scheme="dark", viewport=PHONE) as page:
-        until(page, TRACKED)
+        until(page, LOADED)
         open_section(page, "view")
         size_px = "parseFloat(getComputedStyle(document.querySelector('#side h2:not([hidden])')).fontSize)"
         before_px = page.evaluate(size_px)
@@ -178,7 +179,7 @@ def test_a_chosen_look_stays(chromium: Any, station: Running) -> None:
             page.evaluate(f"document.querySelector('input[name={choice}]').click()")
         assert page.evaluate(size_px) == pytest.approx(1.45 * before_px)
         page.reload()
-        until(page, TRACKED)
+        until(page, LOADED)
         assert page.evaluate("document.documentElement.dataset.theme") == "contrast"
         assert page.evaluate(size_px) == pytest.approx(1.45 * before_px)
         assert page.evaluate("document.documentElement.scrollWidth") <= PHONE["width"]
@@ -203,7 +204,8 @@ def test_the_overlay_is_exact_under_zoom(chromium: Any, station: Running) -> Non
         page.mouse.down()
         page.mouse.move(300, 300, steps=4)
         page.mouse.up()
-        page.wait_for_timeout(600)
+        until(page, "document.querySelector('#picture').getBoundingClientRect().width > 1200")
+        page.wait_for_timeout(1000)
         place = page.locator("#picture").bounding_box()
         assert place["width"] > 2 * WIDTH
         assert page.evaluate("document.querySelector('#zoom').getAttribute('aria-label')").startswith("Zoom 2.")
@@ -217,8 +219,10 @@ def test_the_overlay_is_exact_under_zoom(chromium: Any, station: Running) -> Non
         rows = slice(round(bar["height"]) + 60, round(actions["y"]) - 4)
         columns = slice(0, ROOMY["width"])
         ghosted = seen()
+        draws = page.evaluate("window.draws")
         page.keyboard.press("g")
-        page.wait_for_timeout(500)
+        until(page, f"window.draws > {draws}")
+        page.wait_for_timeout(300)
         found = closed(difference_mask(ghosted, seen(), 5), 1)
         whole = true_mask((round(place["height"]), round(place["width"])), number)
         top, left = rows.start - round(place["y"]), -round(place["x"])
@@ -256,10 +260,9 @@ def test_a_wide_picture_is_enlarged_around_the_part_on_a_tall_screen(chromium: A
     with opened(chromium, station, viewport=PHONE) as page:
         until(page, TRACKED)
         until(page, "document.querySelector('#picture').getBoundingClientRect().width > 1.4 * innerWidth")
-        page.wait_for_timeout(1500)
+        until(page, "document.querySelectorAll('#labels .label:not(.off)').length >= 3")
         # The whole part is in view, and failing components out of view are pointed to.
         assert page.evaluate("document.querySelectorAll('#leaders .pointer[visibility=visible]').length") == 0
-        assert page.evaluate("document.querySelectorAll('#labels .label:not(.off)').length") >= 3
         page.click("#zoom-fit")
         until(page, "document.querySelector('#picture').getBoundingClientRect().width <= innerWidth + 1")
         assert page.get_attribute("#zoom-fit", "aria-label") == "Follow the part"
@@ -335,7 +338,7 @@ def test_files_are_listed_opened_and_shared(chromium: Any, station: Running) -> 
         until(page, "window.shared.length === 1")
         assert page.evaluate("window.shared[0]") == ["film.mp4", 4]
         page.reload()  # snapshots stay in this browser
-        until(page, TRACKED)
+        until(page, LOADED)
         open_section(page, "files")
         until(page, "document.querySelectorAll('.files li').length === 3")
 
@@ -450,6 +453,6 @@ def test_a_camera_that_is_denied_or_missing(chromium: Any, station: Running, nam
 
 def test_module_texts_fall_back_to_english(chromium: Any, station: Running, tmp_path: Path) -> None:
     with opened(chromium, station, locale="fr-FR") as page:
-        until(page, TRACKED)
+        until(page, LOADED)
         assert page.evaluate("document.documentElement.lang") == "en"
         assert page.inner_text("#freeze") == "Freeze"

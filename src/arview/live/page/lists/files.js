@@ -31,7 +31,7 @@ export class Files {
       refresh.addEventListener("click", () => this.refresh());
       this.box.replaceChildren(
         ...this.#list("recordings", recordings, (one) => this.#recording(one)),
-        ...(there.length ? this.#list("station_snapshots", there, (one) => this.#stationSnapshot(one)) : []),
+        ...(there instanceof Error || there.length ? this.#list("station_snapshots", there, (one) => this.#stationSnapshot(one)) : []),
         ...this.#list("snapshots", kept, (one) => this.#snapshot(one)),
         ...this.#list("reports", jobs, (one) => this.#report(one)),
         refresh,

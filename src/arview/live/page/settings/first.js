@@ -16,6 +16,7 @@ globalThis.arviewLook = (() => {
   function apply() {
     const root = document.documentElement, { theme, size } = look;
     root.dataset.theme = theme !== "auto" ? theme : contrast.matches ? "contrast" : light.matches ? "light" : "dark";
+    root.dataset.size = size;
     root.style.setProperty("--text-scale", SCALES[size] ?? 1);
     const color = { light: "#ffffff", contrast: "#000000" }[root.dataset.theme] ?? "#10141b";
     document.querySelector('meta[name="theme-color"]')?.setAttribute("content", color);
