@@ -47,7 +47,7 @@ class Workers:
         if self.code is not None:
             process.kill()
             process.wait()
-            process = subprocess.Popen([sys.executable, "-c", self.code, str(job.path)])
+            process = subprocess.Popen([sys.executable, "-c", self.code, str(job.path)], stdin=subprocess.DEVNULL)
         self.processes[job.id] = process
         return process
 
@@ -146,6 +146,45 @@ def test_one_that_breaks_is_started_again_a_few_times(part: Part, tmp_path: Path
     workers.tick_until(lambda: len(workers.started) == 4)
 
 
+def test_one_that_fails_is_told_and_not_started_again(part: Part, tmp_path: Path, made: Any) -> None:
+    job = job_with_photos(part, tmp_path, "BP-1")
+    workers = made()
+    workers.queue.ask(job)
+    workers.queue.tick()
+    job.write_state(WalkState("failed", "the photos do not overlap", 1))
+    workers.processes[job.id].kill()
+    workers.tick_until(lambda: workers.queue.state(job.id) == "none")
+    workers.queue.tick()
+    assert workers.started == [job.id]
+
+
+def test_the_end_of_a_walk_is_no_reason_to_measure_twice_and_a_late_photo_is(
+    part: Part, tmp_path: Path, made: Any
+) -> None:
+    import hashlib
+
+    job = job_with_photos(part, tmp_path, "BP-1", is_ended=False)
+    workers = made("import sys; sys.stdin.read()")
+    workers.queue.ask(job)
+    workers.queue.tick()
+    job.end()
+    workers.queue.ask(job)
+    measured(job)
+    workers.tick_until(lambda: workers.queue.state(job.id) == "none")
+    assert workers.started == [job.id]
+    content = photo(50, 120)
+    job.reopen()
+    workers.queue.ask(job)
+    workers.queue.tick()
+    job.add_photo(content, hashlib.sha256(content).hexdigest())
+    job.end()
+    time.sleep(0.01)
+    workers.queue.ask(job)
+    workers.tick_until(lambda: len(workers.started) == 3)  # the second one did not know of the photo
+    workers.tick_until(lambda: workers.queue.state(job.id) == "none")
+    assert len(workers.started) == 3
+
+
 def test_workers_end_with_the_server_also_those_that_do_not_listen(part: Part, tmp_path: Path, made: Any) -> None:
     deaf = "import signal, time\nsignal.signal(signal.SIGTERM, signal.SIG_IGN)\nwhile True: time.sleep(0.1)"
     one, two = (job_with_photos(part, tmp_path, f"BP-{k}") for k in (1, 2))
@@ -181,7 +220,7 @@ def test_the_next_server_continues_and_takes_over_what_runs(part: Part, tmp_path
     first.queue.ask(running)
     first.queue.tick()
     pid = first.processes[running.id].pid
-    assert running_worker(running) == pid  # the server is killed: its worker goes on
+    wait(lambda: running_worker(running) == pid)  # the server is killed: its worker goes on
     second = made(workers=3)
     second.queue.resume([running, open_walk, done, empty, old])
     second.queue.tick()

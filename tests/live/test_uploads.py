@@ -16,7 +16,7 @@ import pytest
 
 from arview.cad import load_part
 from arview.cad.part import Part
-from arview.live.jobs.uploads import Space, Uploads, folder_bytes
+from arview.live.jobs.uploads import PhotoSpace, Uploads, folder_bytes
 from arview.live.security.refusals import Refusal
 from arview.workflow.walk.job import JobFolder
 from helpers.live_jobs import about, job_options, photo
@@ -34,7 +34,7 @@ def new_job(part: Part, folder: Path, serial: str = "BP-1") -> JobFolder:
 
 def uploads_of(job: JobFolder, folder: Path, **more: Any) -> Uploads:
     options = job_options(folder, **more)
-    return Uploads(job, options, Space(options))
+    return Uploads(job, options, PhotoSpace(options))
 
 
 def sent(uploads: Uploads, content: bytes, size: int = 30_000) -> str:
@@ -212,7 +212,7 @@ def test_a_disk_that_is_really_full(part: Part, small_disk: Path) -> None:
 def test_two_phones_at_once_on_two_serials(part: Part, tmp_path: Path) -> None:
     jobs = [new_job(part, tmp_path, f"BP-{number}") for number in range(2)]
     options = job_options(tmp_path)
-    space = Space(options)
+    space = PhotoSpace(options)
     failures: list[BaseException] = []
 
     def phone(number: int) -> None:

@@ -122,7 +122,9 @@ withheld until the followed one is seen again, a code on the part gives the seri
 \b
 A page can start the inspection of a specimen by its serial number: photos, measurement, rework, decisions. Each is
 a folder in --jobs (arview_jobs in the current folder, made with the first one); what the page has confirmed is
-there after a crash, and the next start continues measurements that are not finished.
+there after a crash, and the next start continues measurements that are not finished. Full-size photos of a phone
+show more than its video: --photo-camera is their calibrated camera, else it is estimated from them (--camera is used
+if --size has the shape 4:3 of photos).
 
 \b
 Several at once. --part may be given again, and --instances N shows N specimens of each part. Each has a name
@@ -149,6 +151,7 @@ seconds.""",
     "--source", default="phone", show_default=True, metavar="SOURCE", help="Camera or video to show; see below."
 )
 @click.option("--camera", "camera_spec", metavar="CAMERA", help="Camera file or fov:DEG; see below.")
+@click.option("--photo-camera", metavar="CAMERA", help="Camera of the full-size photos of phones; see below.")
 @click.option("--save-profile", "profile", metavar="NAME", help="Keep the estimated camera as a profile; see below.")
 @click.option("--init", metavar="guide:NAME", help="Align the part with an outline first, as in annotate.")
 @click.option(
@@ -187,6 +190,7 @@ def live(
     inspection_paths: tuple[str, ...],
     source: str,
     camera_spec: str | None,
+    photo_camera: str | None,
     profile: str | None,
     init: str | None,
     host: str | None,
@@ -226,6 +230,7 @@ def live(
     options = LiveOptions(
         source=source,
         camera=camera_spec,
+        photo_camera=photo_camera,
         profile=profile,
         devices=devices_path(),
         inspections=tuple(Path(path) for path in inspection_paths),

@@ -135,6 +135,7 @@ class LiveOptions:
 
     source: str = PHONE  # "phone": each page sends its own camera; else a source of arview.video.open_source
     camera: str | None = None  # camera of arview.camera.read.load_camera; None: guessed, and the page says so
+    photo_camera: str | None = None  # of the full-size photos of phones, whose view differs from that of their video
     profile: str | None = None  # name of the profile in which an estimated camera is kept; None: it is not kept
     devices: Path | None = None  # file of the paired devices; None: they are forgotten at the end of the run
     inspections: tuple[Path, ...] = ()  # inspection.json of the parts, in their order, read again when they change
@@ -187,6 +188,18 @@ class LiveOptions:
     def is_phone(self) -> bool:
         """Whether each page sends its own camera."""
         return self.source == PHONE
+
+    @property
+    def job_camera(self) -> str | None:
+        """Camera of the photos of inspections that pages start; None: estimated from them.
+
+        A station's photos are its frames. Full-size photos of phones show all of the sensor, 4:3, so a camera of their
+        video is theirs only if it has that shape.
+        """
+        if not self.is_phone:
+            return self.camera
+        is_whole = abs(self.width * 3 - self.height * 4) <= 0.02 * self.width
+        return self.photo_camera or (self.camera if is_whole else None)
 
     @property
     def max_clients(self) -> int:

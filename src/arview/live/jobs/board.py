@@ -11,7 +11,7 @@ from pathlib import Path
 from arview.cad.model import Model
 from arview.errors import ArviewError, InputError, OutputError
 from arview.inspection import Inspection, load_inspection
-from arview.live.jobs.uploads import Space, Uploads
+from arview.live.jobs.uploads import PhotoSpace, Uploads
 from arview.live.options import JobOptions
 from arview.live.security.refusals import Refusal
 from arview.live.stream.subject import Subject
@@ -36,7 +36,7 @@ class JobBoard:
 
     def __init__(self, options: JobOptions) -> None:
         self.options = options
-        self.space = Space(options)
+        self.space = PhotoSpace(options)
         self._lock = threading.RLock()
         self._known: dict[str, JobFolder] = {}
         self._uploads: dict[str, Uploads] = {}

@@ -72,7 +72,7 @@ class Uploads:
         space: bytes that may still be written to the folder of the jobs.
     """
 
-    def __init__(self, job: JobFolder, options: JobOptions, space: Space) -> None:
+    def __init__(self, job: JobFolder, options: JobOptions, space: PhotoSpace) -> None:
         self._job, self._options, self._space = job, options, space
         self._folder = job.path / "uploads"
         self._lock = threading.Lock()
@@ -254,7 +254,7 @@ class Uploads:
                 (self._folder / f"{name}{suffix}").unlink(missing_ok=True)
 
 
-class Space:
+class PhotoSpace:
     """Room for photos: the free disk and the quota of the folder of the jobs; safe to use from several threads.
 
     Args:

@@ -24,6 +24,7 @@ from typing import Literal
 from arview.errors import ArviewError
 from arview.live.options import JobOptions
 from arview.workflow.walk.job import JobFolder, start_worker
+from arview.workflow.walk.records import WalkState
 
 logger = logging.getLogger("arview.live")
 
@@ -175,13 +176,14 @@ class WorkerQueue:
         entry.process = entry.pid = None
         _forget_pid(entry.job)
         state = entry.job.state()
-        is_finished = state.stage in ("done", "failed") and state.cloud not in ("running", "waiting")
+        knows_all = state.photos >= len(entry.job.photos()) or entry.asked_s <= entry.started_s
+        is_finished = state.stage == "failed" or (state.stage == "done" and (code == 0 or not _has_cloud(state)))
         if entry.stopping:
             entry.stopping = False
-        elif state.stage in ("done", "failed") and entry.asked_s <= entry.started_s and (is_finished or code == 0):
+        elif is_finished and knows_all:
             del self._entries[entry.job.id]
-        elif code == 0 and entry.asked_s > entry.started_s:
-            pass  # asked again while it was ending: it is started once more
+        elif is_finished or (code == 0 and not knows_all):
+            pass  # a photo came while it was ending: it is started once more
         else:
             logger.warning("the measurement of %s broke off (exit code %s); see worker.log", entry.job.id, code)
             self._broke(entry)
@@ -237,7 +239,12 @@ def _signal(entry: _Entry, number: signal.Signals) -> None:
 def _is_only_cloud(entry: _Entry) -> bool:
     """Whether nothing is left of a job but its cloud, which can wait."""
     state = entry.job.state()
-    return state.stage == "done" and state.cloud in ("waiting", "running") and entry.asked_s <= entry.started_s
+    return state.stage == "done" and _has_cloud(state) and state.photos >= len(entry.job.photos())
+
+
+def _has_cloud(state: WalkState) -> bool:
+    """Whether the cloud of a measured job is still to be made."""
+    return state.cloud in ("waiting", "running")
 
 
 def _urgency(entry: _Entry) -> tuple[bool, bool, float]:
@@ -253,4 +260,4 @@ def _has_work(job: JobFolder, recent: float) -> bool:
     if state.stage in ("collecting", "measuring"):
         with suppress(OSError):
             return job.is_ended or (job.path / "photos.jsonl").stat().st_mtime > recent
-    return state.stage == "done" and state.cloud in ("waiting", "running")
+    return state.stage == "done" and _has_cloud(state)

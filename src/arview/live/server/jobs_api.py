@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import hashlib
+from collections import OrderedDict
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
@@ -24,6 +25,7 @@ from arview.decisions import (
 from arview.errors import InputError, OutputError
 from arview.live.jobs.desk import JobDesk
 from arview.live.jobs.documents import job_document, job_row, rework
+from arview.live.jobs.records import tell_report_and_history
 from arview.live.jobs.uploads import Upload, store_photo
 from arview.live.security.limits import RateLimit, body, json_body
 from arview.live.security.refusals import Refusal
@@ -41,6 +43,8 @@ REPORT_POLICY = "sandbox allow-scripts allow-popups allow-downloads allow-modals
 """The report brings a policy of its own; here it is kept away from the pages of this origin."""
 DRAWING_POLICY = "default-src 'none'; style-src 'unsafe-inline'; frame-ancestors 'self'"
 """A drawing holds its own styles and runs nothing."""
+KEPT_DRAWINGS = 64
+"""Drawings that are kept; one takes half a second."""
 PICTURE_TYPES = {".jpg": "image/jpeg", ".jpeg": "image/jpeg", ".png": "image/png", ".webp": "image/webp"}
 """Pictures of instructions that are served."""
 PHOTO_QUALITY = 95
@@ -56,6 +60,8 @@ class JobHandlers:
         self._desk: JobDesk = hub.desk
         limits = hub.options.requests
         self._starts = RateLimit(limits.joins_per_s, limits.joins_burst)
+        self._following: set[asyncio.Future[None]] = set()
+        self._drawings: OrderedDict[tuple[str, str, int], str] = OrderedDict()
 
     @property
     def routes(self) -> list[Route]:
@@ -104,7 +110,7 @@ class JobHandlers:
         part, serial = wanted.get("part", 0), wanted.get("serial")
         if type(part) is not int or not isinstance(serial, str):
             raise Refusal(400, "bad_request", "expected the number of a part and a serial number")
-        job, is_new = await asyncio.to_thread(self._desk.start, part, serial, self._hub.options.camera)
+        job, is_new = await asyncio.to_thread(self._desk.start, part, serial, _absolute(self._hub.options.job_camera))
         return await self._document(job, 201 if is_new else 200)
 
     async def job(self, request: Request) -> Response:
@@ -226,7 +232,7 @@ class JobHandlers:
         one = {"component": "", "is_ok": None, "photo": None} | await self._json(request)
         texts = [one.get(key) or "" for key in ("reason", "note", "by")]
         return await self._kept(
-            lambda: decide_component(job.path, one["component"], one["is_ok"], *texts, photo=one["photo"])
+            job, lambda: decide_component(job.path, one["component"], one["is_ok"], *texts, photo=one["photo"])
         )
 
     async def tick(self, request: Request) -> Response:
@@ -234,14 +240,14 @@ class JobHandlers:
         job = await self._measured(request)
         one = {"component": "", "step": None, "is_done": None} | await self._json(request)
         return await self._kept(
-            lambda: tick_step(job.path, one["component"], one["step"], one["is_done"], one.get("by") or "")
+            job, lambda: tick_step(job.path, one["component"], one["step"], one["is_done"], one.get("by") or "")
         )
 
     async def sign(self, request: Request) -> Response:
         """Keep a signature."""
         job = await self._measured(request)
         one = await self._json(request)
-        return await self._kept(lambda: sign_inspection(job.path, one.get("by") or "", one.get("note") or ""))
+        return await self._kept(job, lambda: sign_inspection(job.path, one.get("by") or "", one.get("note") or ""))
 
     async def decisions(self, request: Request) -> Response:
         """The decisions as CSV."""
@@ -271,8 +277,14 @@ class JobHandlers:
         part, inspection = self._desk.part(job), self._desk.board.inspection(job)
         if part is None or inspection is None or inspection.find(request.path_params["component"]) is None:
             raise Refusal(404, "not_found", "there is no such component here")
-        svg = await self._stored(lambda: drawing_svg(part, inspection, request.path_params["component"]))
-        return Response(svg, media_type="image/svg+xml", headers={"Content-Security-Policy": DRAWING_POLICY})
+        component = request.path_params["component"]
+        key = job.id, component, (job.path / "inspection.json").stat().st_mtime_ns
+        if key not in self._drawings:
+            self._drawings[key] = await self._stored(lambda: drawing_svg(part, inspection, component))
+            while len(self._drawings) > KEPT_DRAWINGS:
+                self._drawings.popitem(last=False)
+        headers = {"Content-Security-Policy": DRAWING_POLICY}
+        return Response(self._drawings[key], media_type="image/svg+xml", headers=headers)
 
     async def picture(self, request: Request) -> Response:
         """A picture of an instruction, by the name that the instruction has for it."""
@@ -312,9 +324,13 @@ class JobHandlers:
     async def _document(self, job: JobFolder, status: int = 200) -> Response:
         return JSONResponse(await self._stored(lambda: job_document(job, self._desk)), status)
 
-    async def _kept(self, write: Callable[[], Decision]) -> Response:
-        """Add an entry to the log of decisions; it is answered when it is on the disk."""
-        return JSONResponse(decision_document(await self._stored(write)), 201)
+    async def _kept(self, job: JobFolder, write: Callable[[], Decision]) -> Response:
+        """Add an entry to the log of decisions; it is answered when it is on the disk, then report and store follow."""
+        kept = await self._stored(write)
+        following = asyncio.ensure_future(asyncio.to_thread(tell_report_and_history, job))
+        self._following.add(following)
+        following.add_done_callback(self._following.discard)
+        return JSONResponse(decision_document(kept), 201)
 
     async def _stored(self, work: Callable[[], T]) -> T:
         """Do something with files in a thread; what is wrong becomes an answer."""
@@ -329,6 +345,14 @@ class JobHandlers:
         return await json_body(
             request, self._desk.board.options.text_bytes, self._hub.options.requests.body_timeout_s
         )  # fmt: skip
+
+
+def _absolute(camera: str | None) -> str | None:
+    """A camera whose file is named from the root: measurements may be continued from another folder."""
+    if camera is None:
+        return None
+    path, _, name = camera.partition(":") if not Path(camera).is_file() else (camera, "", "")
+    return camera if not Path(path).is_file() else f"{Path(path).resolve()}{f':{name}' if name else ''}"
 
 
 def _upload_response(answer: Upload | str) -> Response:

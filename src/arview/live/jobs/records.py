@@ -1,0 +1,36 @@
+"""What follows a decision: it is shown in the report of the job, and copied to the store of results."""
+
+from __future__ import annotations
+
+import logging
+import os
+import threading
+
+from arview.errors import ArviewError
+from arview.history import HistoryStore
+from arview.report.decisions import update_report
+from arview.workflow.walk.job import JobFolder
+
+logger = logging.getLogger("arview.live")
+
+_WRITING = threading.Lock()
+"""One report is changed at a time."""
+
+
+def tell_report_and_history(job: JobFolder) -> None:
+    """Put the decisions of a job into its report, and add them to the store of ``ARVIEW_STORE`` if there is one.
+
+    The log of decisions holds them already: what goes wrong here is told, and mended by the next decision.
+    """
+    report, inspection = job.path / "report.html", job.path / "inspection.json"
+    with _WRITING:
+        try:
+            if report.is_file():
+                update_report(report, inspection)
+            if store := os.environ.get("ARVIEW_STORE"):
+                with HistoryStore(store) as opened:
+                    opened.add(inspection)
+        except ArviewError as error:
+            logger.warning("%s: %s", job.id, error)
+        except Exception:
+            logger.exception("the decisions of %s could not be put into its report", job.id)
