@@ -11,6 +11,7 @@ import { allowSound, signal } from "./signals.js";
 import { counts, verdictWord } from "./verdicts.js";
 
 const RETRY_MS = 3000; // a photo that could not be taken is asked for again after this time
+const CELLS_EVERY_MS = 1500;
 const SILENT_MS = 1500; // without advice for so long, the page says that the part is not tracked
 
 export class CaptureView {
@@ -20,6 +21,7 @@ export class CaptureView {
   #adviceMs = -Infinity;
   #pose = null;
   #wasEnough = false;
+  #cellsMs = -Infinity;
 
   /**
    * @param host of the page. @param queue of the uploads.
@@ -80,25 +82,30 @@ export class CaptureView {
   }
 
   /** Begin, or go on, to take photos of a job; `part` is the number of its part, `components` its components. */
-  async open(job, part, document) {
+  open(job, part, document) {
     if (this.job?.id === job.id) return this.refresh(job);
     Object.assign(this, { job, part });
     this.#lastTake = this.#advice = null;
     this.#wasEnough = false;
     this.wanted = null;
+    this.#cellsMs = -Infinity;
     this.needs.setComponents(document.components, part);
     this.element.hidden = false;
     this.motion.start();
+    this.center = document.part.center_in_model;
     this.refresh(job);
-    try {
-      const cells = await getCells(job.id);
-      if (this.job?.id !== job.id) return;
-      this.wanted = cells.wanted_photos;
-      this.dome.setGeometry(cells, document.part.center_in_model);
-      this.refresh(this.job);
-    } catch (error) {
-      this.events.onTrouble(error.message);
-    }
+  }
+
+  /** Get the cells of the dome, again until the station has made them. */
+  async #getCells() {
+    const { job } = this, nowMs = performance.now();
+    if (nowMs - this.#cellsMs < CELLS_EVERY_MS) return;
+    this.#cellsMs = nowMs;
+    const cells = await getCells(job.id).catch(() => null);
+    if (this.job?.id !== job.id || !cells?.cells) return;
+    this.wanted = cells.wanted_photos;
+    this.dome.setGeometry(cells, this.center);
+    this.#draw();
   }
 
   close() {
@@ -135,6 +142,7 @@ export class CaptureView {
   refresh(job = this.job) {
     if (!job) return;
     this.job = job;
+    if (this.wanted === null) this.#getCells();
     this.#draw();
   }
 
