@@ -16,7 +16,6 @@ from typing import Any
 import cv2
 import numpy as np
 
-from arview.camera import Camera
 from arview.geometry import Array
 from arview.pose import ComponentPresence, Pose, Presence, TrackingState, Visibility
 from arview.video import Image
@@ -134,6 +133,7 @@ class WalkSession:
 
     def __init__(self, walk: Sequence[Stop], names: Sequence[str]) -> None:
         self.walk = walk
+        self.identity = self
         present = ComponentPresence(Presence.PRESENT, Visibility.VISIBLE, 0.99, 9, 40.0)
         self._components = dict.fromkeys(names, present)
 
