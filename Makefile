@@ -6,10 +6,11 @@ SAMPLE := samples/plate
 # A worker for each core; each test file goes to one worker, in the order of tests/conftest.py.
 PARALLEL := -n auto --dist loadgroup --no-loadscope-reorder
 
-.PHONY: help demo test test-fast check docs guideviews bench evaluate soak screens clean
+.PHONY: help demo demo-live test test-fast check docs guideviews bench evaluate soak screens clean
 
 help:
 	@echo "make demo      inspect the sample plate: report and annotated video in out/demo"
+	@echo "make demo-live the whole inspection on the live page, unattended: report and pictures in out/demo-live"
 	@echo "make test      formatting, linting, types, all tests: ten minutes on two cores"
 	@echo "make test-fast the quick tests of every room: a minute"
 	@echo "make check     formatting, linting, types"
@@ -29,6 +30,10 @@ $(READY): pyproject.toml $(wildcard requirements.lock) tools/setup
 demo: $(READY)
 	.venv/bin/arview inspect --part $(SAMPLE)/part.toml --photos $(SAMPLE)/photos --video $(SAMPLE)/clip.mp4 \
 	    -o out/demo; code=$$?; [ $$code -eq 1 ] || { echo "demo: exit code $$code, expected 1" >&2; exit 1; }
+
+# Chromium and the tracker share the cores: a few minutes on two of them.
+demo-live: $(READY)
+	.venv/bin/python tools/demo_live.py -o out/demo-live
 
 test: check
 	.venv/bin/python -m pytest $(PARALLEL)

@@ -14,6 +14,7 @@ import shutil
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "tools" / "benchmarks")]  # what the tests drive a browser with
@@ -52,10 +53,10 @@ def main() -> int:
     return 0
 
 
-def run(chromium: object, link: str, out: Path, serial: str, patience_s: float) -> None:
+def run(chromium: Any, link: str, out: Path, serial: str, patience_s: float) -> None:
     """Inspect the plate on the page behind a link."""
     first, second = first_walk(), second_walk()
-    context = chromium.new_context(viewport=PHONE, device_scale_factor=2)  # type: ignore[attr-defined]
+    context = chromium.new_context(viewport=PHONE, device_scale_factor=2)
     page = context.new_page()
     page.add_init_script(camera_script(is_numbered=False))
     inspector = Inspector(page, [*first, *second], say, patience_s, limit_s=900.0)
@@ -70,7 +71,8 @@ def run(chromium: object, link: str, out: Path, serial: str, patience_s: float) 
     picture("1_photos")
     job = inspector.measure("last photo to all verdicts")
     picture("2_verdict")
-    print(f"  {inspector.by_hand} of {len(first)} photos by the shutter; {job['inspection']['sentence']}")
+    print(f"  {inspector.by_hand} of the photos that were wanted were taken by the shutter")
+    print(f"  {job['inspection']['sentence']}")
     numbers = range(len(first), len(first) + len(second))
     again = inspector.check_again(COMPONENT, numbers, BY)
     row = next(one for one in again["before_after"] if one["name"] == COMPONENT)

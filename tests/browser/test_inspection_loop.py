@@ -1,7 +1,7 @@
 """The whole inspection on the page: photos, verdict, rework, check again, decisions, signature, report.
 
-Small: half of the plate's photos, at half their size, and the session is told where the camera is. `make demo-live` does
-the same with all photos and the tracker.
+Small: half of the plate's photos, at half their size, and the session is told where the camera is. `make demo-live`
+does the same with all photos and the tracker.
 """
 
 from __future__ import annotations

@@ -10,10 +10,10 @@ import json
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from arview.geometry import Array
@@ -37,7 +37,8 @@ CAMERA_SCRIPT = """
   window.walk = walk;
   const full = async (index) => (await fetch(`/full-size/${index}`)).blob();
   walk.show = async (index) => {
-    walk.picture = await createImageBitmap(await full(index), { resizeWidth: WIDTH, resizeHeight: HEIGHT, resizeQuality: "high" });
+    const size = { resizeWidth: WIDTH, resizeHeight: HEIGHT, resizeQuality: "high" };
+    walk.picture = await createImageBitmap(await full(index), size);
     walk.index = index;
   };
   const draw = () => {
@@ -167,7 +168,7 @@ class Inspector:
         say: told what was done, with the seconds that it took.
         patience_s: at a place before the shutter is pressed by hand.
         limit_s: of every wait.
-        by_hand: photos for which the shutter was pressed.
+        by_hand: photos that the page had wanted and for which the shutter was pressed.
         times_s: of the steps.
     """
 
@@ -230,14 +231,18 @@ class Inspector:
         for number in numbers:
             self.page.evaluate("number => window.walk.show(number)", number)
             end_s = time.monotonic() + self.patience_s
-            while not self._has(number) and time.monotonic() < end_s:
+            while not self._has(number) and time.monotonic() < end_s and not self._is_enough():
                 self.page.wait_for_timeout(100)
             if not self._has(number):
-                self.by_hand += 1
+                self.by_hand += not self._is_enough()
                 self.page.click("#job-hud .shutter")
-                self.until(lambda number=number: self._has(number), f"photo {number}")
+                self.until(partial(self._has, number), f"photo {number}")
         self.until(lambda: "stored" in self.page.inner_text(".hud-state"), "that all photos are stored")
         self.timed(step, begun_s)
+
+    def _is_enough(self) -> bool:
+        """Whether the page asks for no more photos: those that come then are taken by the shutter."""
+        return bool(self.page.locator("#job-hud.is-enough").count())
 
     def _has(self, number: int) -> bool:
         return bool(self.page.evaluate("number => window.walk.taken.includes(number)", number))
