@@ -37,6 +37,7 @@ class ReworkOptions:
     """What is asked for."""
 
     sideways_share: float = 0.25  # of the tolerance: what may remain beside a move that is called by a near direction
+    min_share: float = 0.1  # of the tolerance: shorter moves are not asked for either
     end_share: float = 0.5  # of the tolerance: a turn that moves the ends by more is asked for without an angle limit
     min_turn_deg: float = 0.02  # below which no turn is asked for
     naming: NamingOptions = field(default_factory=NamingOptions)
@@ -168,7 +169,7 @@ def _seat_words(standing: Standing, part: Part) -> tuple[str, str]:
 def _moves(
     one: ComponentDeviation, standing: Standing, correction: Correction, names: _Names, part: Part, o: ReworkOptions
 ) -> tuple[ReworkMove, ...]:
-    """The moves that are larger than their U; all of them if the distance fails though none is."""
+    """The moves that are larger than their U and matter; all of them if the distance fails though none is."""
     if one.tolerance_mm is None:
         return ()
     shift, normal = correction.shift_mm, standing.normal_in_model
@@ -184,7 +185,7 @@ def _moves(
         direction = NamedDirection(normal * np.sign(height), text)
         steps.append(NamedStep(direction, direction.in_model, abs(height), direction.in_model))
     sized = [(step, correction.shift_uncertainty_mm(step.row)) for step in steps]
-    asked = [(step, u) for step, u in sized if step.length > u]
+    asked = [(step, u) for step, u in sized if step.length > max(u, o.min_share * one.tolerance_mm)]
     fails = one.distance_mm is not None and one.distance_mm > one.tolerance_mm
     if not asked and fails:
         asked = sized

@@ -30,6 +30,7 @@ class NamingOptions:
     side_cost: float = 1.8  # sides of the part, where nothing better is there
     pair_cost: float = 0.8  # two moves instead of one
     oblique_cost: float = 0.6  # two directions that are 45° off the right angle
+    detour_cost: float = 2.0  # for each length of the move that two steps take more than two at a right angle can
 
 
 @dataclass(frozen=True)
@@ -218,7 +219,9 @@ def _best_steps(
             lengths = rows @ vector
             if lengths.min() <= 0.0:
                 continue
+            detour = max(0.0, float(lengths.sum()) / length - np.sqrt(2.0))
             cost = one.cost + other.cost + o.pair_cost + o.oblique_cost * abs(between - 90.0) / 45.0
+            cost += o.detour_cost * detour
             if cost < best[0]:
                 steps = [
                     NamedStep(which, which.in_model, float(lengths[k]), rows[k]) for k, which in enumerate((one, other))
