@@ -137,6 +137,24 @@ def test_the_report_tells_the_rework_with_its_drawing(job: Path) -> None:
     assert section.count('<span class="box">') == 4
 
 
+def test_components_that_were_checked_again_are_beside_their_first_measurement(job: Path, tmp_path: Path) -> None:
+    make_report(job / "inspection.json", job / "report.html")
+    folder = job / "recheck" / "01"
+    folder.mkdir(parents=True)
+    block = deviation("block_2", (0.1, 0.0, 0.0), CENTER["block_2"])
+    save_inspection(inspection(MODEL, (block,), minutes=10), folder / "inspection.json")
+    assert run("sign", folder, "--by", "Grace", "--store", tmp_path / "results.sqlite").exit_code == 0
+    page = (job / "report.html").read_text()
+    section = page.split('<section id="decisions">')[1].split("</section>")[0]
+    assert "Checked again after rework" in section
+    assert "Fail, 3.000 ± 0.060 mm of 0.5" in section and "Pass, 0.100 ± 0.060 mm of 0.5" in section
+    assert "Released by Grace" in section and "block_2 in tolerance after rework" in section
+    listed = run("history", "list", "--store", tmp_path / "results.sqlite").output
+    assert listed.count("released") == 1 and "2 results" in listed
+    shown = run("history", "show", "2", "--store", tmp_path / "results.sqlite").output
+    assert "block_2 in tolerance after rework" in shown
+
+
 # ---- exports
 
 

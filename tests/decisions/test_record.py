@@ -18,10 +18,12 @@ from arview.decisions import (
     state_of_record,
     tick_step,
 )
+from arview.decisions.folder import photo_path
 from arview.errors import InputError
 from arview.inspection import Verdict, load_inspection, save_inspection
+from arview.inspection.fingerprint import fingerprint_of_file
 from arview.inspection.summary import overall_verdict
-from helpers.inspections import bench_inspection, deviation, inspection
+from helpers.inspections import bench_inspection, deviation, inspection, not_measured
 from helpers.photo_scene import bench
 
 MODEL = bench()
@@ -162,3 +164,82 @@ def test_the_table_has_a_line_for_each_entry(job: Path) -> None:
     assert rows[1]["step"] == "2" and rows[1]["is_done"] == "true" and rows[1]["decision"] == ""
     assert rows[2]["by"] == "Grace" and len(rows[2]["inspection_sha256"]) == 64
     assert {row["serial"] for row in rows} == {"SN-7"}
+
+
+def recheck(job: Path, number: int, moved: tuple[float, float, float]) -> Path:
+    """A check of block_2 after its rework, as a job of its own in the job folder."""
+    folder = job / "recheck" / f"{number:02d}"
+    (folder / "photos").mkdir(parents=True)
+    (folder / "photos" / "0001.jpg").write_bytes(b"x")
+    (folder / "job.json").write_text('{"format": "arview job", "components": ["block_2"]}')
+    made = inspection(
+        MODEL,
+        (not_measured("block_1", CENTER["block_1"]), deviation("block_2", moved, CENTER["block_2"])),
+        minutes=10 * number,
+    )
+    save_inspection(made, folder / "inspection.json")
+    return folder
+
+
+def test_a_component_in_tolerance_after_rework_is_released(job: Path) -> None:
+    decide_component(job, "block_2", False, "to be moved", by="Ada")
+    recheck(job, 1, (0.1, 0.0, 0.0))
+    sign_inspection(job, "Grace")
+    state = state_of_record(job)
+    assert state.is_released and not state.rejected and not state.undecided
+    assert state.sentence.endswith("UTC, with block_2 in tolerance after rework")
+    assert [one.reason for one in state.earlier] == ["to be moved"]  # about the first measurement: it no longer counts
+    (checked,) = state.rechecked
+    assert (checked.before.verdict, checked.after.verdict) == (Verdict.FAIL, Verdict.PASS)
+    assert state_document(state)["rechecked"] == ["block_2"]
+
+
+def test_a_check_after_the_signature_voids_it(job: Path) -> None:
+    decide_component(job, "block_2", True, "agreed", by="Ada")
+    sign_inspection(job, "Grace")
+    assert state_of_record(job).is_released
+    recheck(job, 1, (0.1, 0.0, 0.0))
+    state = state_of_record(job)
+    assert not state.is_released and "checked again after it" in state.sentence
+    sign_inspection(job, "Grace")
+    assert state_of_record(job).is_released
+
+
+def test_a_check_that_fails_is_decided_about_anew(job: Path) -> None:
+    decide_component(job, "block_2", True, "agreed", by="Ada")
+    recheck(job, 1, (0.1, 0.0, 0.0))
+    recheck(job, 2, (1.1, 0.0, 0.0))
+    sign_inspection(job, "Grace")
+    state = state_of_record(job)
+    assert not state.is_released and state.undecided == ("block_2",)
+    with pytest.raises(InputError, match="reason: is empty"):
+        decide_component(job, "block_2", True, "", by="Ada")
+    decide_component(job, "block_2", True, "as good as it gets", by="Ada")
+    sign_inspection(job, "Grace")
+    state = state_of_record(job)
+    assert state.is_released and "1 deviation accepted (block_2: as good as it gets)" in state.sentence
+    newest = fingerprint_of_file(job / "recheck" / "02" / "inspection.json")
+    assert log_of(job).latest()["block_2"].inspection_sha256 == newest
+
+
+def test_a_check_has_the_record_of_the_first_measurement(job: Path) -> None:
+    folder = recheck(job, 1, (1.1, 0.0, 0.0))
+    made = decide_component(folder, "block_2", True, "fine", by="Ada", photo="0001.jpg")
+    assert made.photo == "recheck/01/0001.jpg"
+    assert photo_path(job, made.photo) == job / "recheck" / "01" / "photos" / "0001.jpg"
+    tick_step(folder, "block_2", 0, True, "Ada")
+    sign_inspection(folder, "Grace")
+    assert decisions_path(folder) == decisions_path(job) and not (folder / "decisions.jsonl").exists()
+    assert len(log_of(job).entries()) == 3
+    assert state_of_record(folder) == state_of_record(job) and state_of_record(job).is_released
+    for name in ("recheck/../x/y", "recheck/.a/b", "../x", "a/b", "recheck/01/..", "recheck/01/.x"):
+        assert photo_path(job, name) is None
+
+
+def test_a_changed_check_voids_the_signature(job: Path) -> None:
+    folder = recheck(job, 1, (0.1, 0.0, 0.0))
+    sign_inspection(job, "Grace")
+    assert state_of_record(job).is_released
+    made = inspection(MODEL, (deviation("block_2", (0.05, 0.0, 0.0), CENTER["block_2"]),))
+    save_inspection(made, folder / "inspection.json")
+    assert not state_of_record(job).is_released

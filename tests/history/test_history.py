@@ -600,7 +600,7 @@ def test_a_store_of_version_1_is_read_as_it_is_and_upgraded_when_written(tmp_pat
     with HistoryStore(where, must_exist=True) as store:
         assert store.void("1", "why").void is not None
         assert store.listed() == []
-    assert outside.execute("SELECT max(version) FROM arview_store").fetchone() == (2,)
+    assert outside.execute("SELECT max(version) FROM arview_store").fetchone() == (3,)
     outside.close()
 
 

@@ -429,13 +429,8 @@ def _print_decisions(rows: Sequence[tuple[StoredResult, Decision]], zone: tzinfo
 
 def _states(store: HistoryStore, found: Sequence[StoredResult]) -> dict[int, RecordState]:
     """What people decided about results, for those about which there is something."""
-    from arview.history.decided import stored_state
-
     by_id = {one.id: one for one in found}
-    return {
-        number: stored_state(store.find(by_id[number].content_hash)[1], by_id[number].content_hash, entries)
-        for number, entries in store.decided(list(by_id)).items()
-    }
+    return {number: store.state(by_id[number], entries) for number, entries in store.decided(list(by_id)).items()}
 
 
 def _decided_word(state: RecordState | None) -> str:

@@ -200,11 +200,13 @@ def sign(job: str, note: str, by: str, store: str | None) -> None:
     sign_inspection(job, by, note)
     is_released = _told_state(job)
     if store is not None:
-        from arview.decisions.folder import inspection_path
+        from arview.decisions.folder import first_inspection, rechecks_of
         from arview.history import HistoryStore
 
         with HistoryStore(store) as opened:
-            added = opened.add(inspection_path(job))
+            for path, _ in rechecks_of(job):
+                opened.add(path)
+            added = opened.add(first_inspection(job))
             click.echo(f"{opened.name}: result {added.id}, {added.decisions} new entries")
     click.get_current_context().exit(ExitCode.DONE if is_released else ExitCode.FAIL)
 
@@ -253,16 +255,13 @@ def decisions(job: str, output: str | None) -> None:
 def _told_state(job: str) -> bool:
     """Print what was decided so far, and bring the report up to date; whether the part is released."""
     from arview.decisions import state_of_record
-    from arview.decisions.folder import inspection_path
-    from arview.report.decisions import update_report
+    from arview.report.decisions import update_reports
 
     state = state_of_record(job)
     for line in (*state.faults, *state.notices):
         say(line)
     if state.sentence:
         click.echo(state.sentence)
-    path = inspection_path(job)
-    page = path.with_name("report.html")
-    if page.is_file() and not update_report(page, path):
+    for page in update_reports(job):
         say(f"{page}: has no place for these decisions; write it again with `arview report`")
     return state.is_released

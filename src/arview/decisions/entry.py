@@ -44,6 +44,7 @@ class Decision:
         step: of a tick: index of the step of the rework.
         is_done: of a tick.
         inspection_sha256: fingerprint of the inspection that was signed or decided about; empty if unknown.
+        rechecks: of a signature: fingerprints of the checks of reworked components that it holds for, in their order.
         previous: SHA-256 of the line before it.
         sha256: SHA-256 of its own line.
     """
@@ -60,6 +61,7 @@ class Decision:
     step: int | None = None
     is_done: bool | None = None
     inspection_sha256: str = ""
+    rechecks: tuple[str, ...] = ()
     previous: str = FIRST
     sha256: str = ""
 
@@ -67,11 +69,11 @@ class Decision:
 _FIELDS: dict[Kind, tuple[str, ...]] = {
     "decision": ("component", "is_ok", "reason", "note", "photo", "inspection_sha256"),
     "tick": ("component", "step", "is_done"),
-    "signature": ("note", "inspection_sha256"),
+    "signature": ("note", "inspection_sha256", "rechecks"),
 }
 _TYPES: dict[str, tuple[type, ...]] = {
     "component": (str,), "is_ok": (bool,), "reason": (str,), "note": (str,), "photo": (str, type(None)),
-    "step": (int,), "is_done": (bool,), "inspection_sha256": (str,),
+    "step": (int,), "is_done": (bool,), "inspection_sha256": (str,), "rechecks": (list,),
 }  # fmt: skip
 
 
@@ -80,7 +82,9 @@ def decision_document(entry: Decision) -> dict[str, Any]:
     document: dict[str, Any] = {
         "entry": entry.number, "kind": entry.kind, "time": stamp(entry.time), "by": entry.by,
     }  # fmt: skip
-    return document | {name: getattr(entry, name) for name in _FIELDS[entry.kind]} | {"previous": entry.previous}
+    values = {name: getattr(entry, name) for name in _FIELDS[entry.kind]}
+    values |= {name: list(value) for name, value in values.items() if isinstance(value, tuple)}
+    return document | values | {"previous": entry.previous}
 
 
 def line_of(entry: Decision) -> bytes:
@@ -109,6 +113,10 @@ def entry_of(line: bytes, sha256: str) -> Decision:
         if type(document[name]) not in _TYPES[name]:
             raise ValueError(f"{name} has another type")
     values = {name: document[name] for name in _FIELDS[kind]}
+    if "rechecks" in values:
+        if not all(isinstance(one, str) for one in values["rechecks"]):
+            raise ValueError("rechecks has another type")
+        values["rechecks"] = tuple(values["rechecks"])
     return Decision(
         number=number, kind=kind, time=moment.astimezone(UTC), by=document["by"], previous=document["previous"],
         sha256=sha256, **values,

@@ -1,32 +1,51 @@
-"""The decisions that belong to an inspection: where their log is, and checked additions to it."""
+"""The decisions that belong to an inspection: where their log is, and checked additions to it.
+
+A job folder may hold checks of reworked components, ``recheck/01``, ``recheck/02``, …, each with an
+``inspection.json``. They belong to the record of the first measurement: there is one log, that of the first.
+"""
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 from arview.decisions.entry import Decision, checked_name, checked_text
 from arview.decisions.log import DecisionLog
-from arview.decisions.record import RecordState, record_state
+from arview.decisions.record import Recheck, RecordState, record_state
 from arview.errors import InputError
-from arview.inspection import Inspection, Verdict, load_inspection
+from arview.inspection import ComponentDeviation, Inspection, Verdict, load_inspection
 from arview.inspection.fingerprint import fingerprint_of_file
 
 _FILE = "decisions.jsonl"
+_INSPECTION = "inspection.json"
+_RECHECK = "recheck"
 
 
 def inspection_path(target: str | Path) -> Path:
     """``inspection.json`` of a folder, or the file itself."""
     path = Path(target)
-    return path / "inspection.json" if path.is_dir() else path
+    return path / _INSPECTION if path.is_dir() else path
+
+
+def first_inspection(target: str | Path) -> Path:
+    """The inspection to whose record that of a folder or file belongs: of a re-check the first measurement's."""
+    path = inspection_path(target)
+    parents = path.resolve().parents
+    if path.name == _INSPECTION and len(parents) > 2 and parents[1].name == _RECHECK:
+        first = parents[2] / _INSPECTION
+        if first.is_file():
+            return first
+    return path
 
 
 def decisions_path(target: str | Path) -> Path:
     """The log of a job folder or of an inspection.
 
-    It is ``decisions.jsonl`` beside ``inspection.json``; of an inspection of another name, ``NAME.decisions.jsonl``.
+    It is ``decisions.jsonl`` beside ``inspection.json``; of an inspection of another name, ``NAME.decisions.jsonl``; of
+    a re-check that of the first measurement.
     """
-    path = inspection_path(target)
-    return path.with_name(_FILE if path.name == "inspection.json" else f"{path.stem}.{_FILE}")
+    path = first_inspection(target)
+    return path.with_name(_FILE if path.name == _INSPECTION else f"{path.stem}.{_FILE}")
 
 
 def log_of(target: str | Path) -> DecisionLog:
@@ -34,18 +53,52 @@ def log_of(target: str | Path) -> DecisionLog:
     return DecisionLog(decisions_path(target))
 
 
+def rechecks_of(target: str | Path) -> list[tuple[Path, Recheck]]:
+    """The finished checks of reworked components that belong to an inspection, in their order, with their files.
+
+    Raises:
+        InputError: one of them cannot be read.
+    """
+    first = first_inspection(target)
+    if first.name != _INSPECTION:
+        return []
+    found = []
+    for path in sorted((first.parent / _RECHECK).glob(f"*/{_INSPECTION}")):
+        inspection = load_inspection(path)
+        names = _checked_components(path.parent / "job.json")
+        components = tuple(
+            one
+            for one in inspection.components
+            if (one.name in names if names is not None else one.verdict is not Verdict.NOT_MEASURED)
+        )
+        found.append((path, Recheck(fingerprint_of_file(path), inspection.created, components)))
+    return found
+
+
+def _checked_components(path: Path) -> list[str] | None:
+    """Names of the components of a re-check as its job says; None if it does not."""
+    try:
+        names = json.loads(path.read_bytes())["components"]
+    except (OSError, ValueError, TypeError, KeyError):
+        return None
+    return [str(one) for one in names] if isinstance(names, list) else None
+
+
 def state_of_record(target: str | Path, inspection: Inspection | None = None) -> RecordState:
-    """What people decided about the inspection of a folder or file.
+    """What people decided about the inspection of a folder or file; of a re-check about the first measurement's.
 
     Args:
         target: folder or inspection.
         inspection: of the file, if it has been read.
 
     Raises:
-        InputError: the inspection or the log cannot be read.
+        InputError: the inspection, a re-check or the log cannot be read.
     """
-    path = inspection_path(target)
-    return record_state(inspection or load_inspection(path), fingerprint_of_file(path), log_of(path).content())
+    path = first_inspection(target)
+    if inspection is None or path != inspection_path(target):
+        inspection = load_inspection(path)
+    rechecks = [check for _, check in rechecks_of(path)]
+    return record_state(inspection, fingerprint_of_file(path), log_of(path).content(), rechecks)
 
 
 def decide_component(
@@ -53,6 +106,8 @@ def decide_component(
     photo: str | None = None,
 ) -> Decision:  # fmt: skip
     """Add a decision about a component of the inspection of a folder or file, and check what it says.
+
+    It is about the newest measurement of the component. A photo of a re-check is kept as ``recheck/NN/NAME``.
 
     Raises:
         InputError: the inspection has no such component, a component that did not pass is accepted without a reason,
@@ -65,11 +120,20 @@ def decide_component(
     if entry is None:
         known = ", ".join(one.name for one in inspection.components)
         raise InputError(f"{path}: the inspection has no component {name!r}; it has: {known}")
-    has_passed = entry.verdict in (Verdict.PASS, Verdict.MEASURED)
+    measured, newest = _newest(path, entry)
+    has_passed = newest.verdict in (Verdict.PASS, Verdict.MEASURED)
     text = checked_text(reason, "reason", required=not (is_ok and has_passed))
-    if photo is not None:
-        _check_photo(path.parent, photo)
-    return log_of(path).decide(name, is_ok, text, note, by, photo, fingerprint_of_file(path))
+    kept = None if photo is None else _kept_photo(inspection_path(target), path, photo)
+    return log_of(path).decide(name, is_ok, text, note, by, kept, fingerprint_of_file(measured))
+
+
+def _newest(path: Path, entry: ComponentDeviation) -> tuple[Path, ComponentDeviation]:
+    """The newest measurement of a component, and the file of its inspection."""
+    for file, check in reversed(rechecks_of(path)):
+        for one in check.components:
+            if one.name == entry.name:
+                return file, one
+    return path, entry
 
 
 def tick_step(target: str | Path, component: str, step: int, is_done: bool, by: str) -> Decision:
@@ -87,28 +151,43 @@ def tick_step(target: str | Path, component: str, step: int, is_done: bool, by: 
 
 
 def sign_inspection(target: str | Path, by: str, note: str = "") -> Decision:
-    """Sign the inspection of a folder or file as it is now.
+    """Sign the inspection of a folder or file as it is now, with the checks of reworked components that belong to it.
 
     Raises:
         InputError: there is no inspection, or as `DecisionLog.sign`.
         OutputError: the log cannot be written.
     """
     path, _ = _read(target)
-    return log_of(path).sign(by, note, fingerprint_of_file(path))
+    rechecks = [check.sha256 for _, check in rechecks_of(path)]
+    return log_of(path).sign(by, note, fingerprint_of_file(path), rechecks)
+
+
+def photo_path(target: str | Path, photo: str) -> Path | None:
+    """The file of a photo that a decision names; None if the name is not one that `decide_component` makes."""
+    folder = first_inspection(target).parent
+    parts = photo.split("/")
+    if len(parts) == 3 and parts[0] == _RECHECK:
+        folder, parts = folder / _RECHECK / parts[1], parts[2:]
+    if len(parts) != 1 or any(part.startswith(".") for part in photo.split("/")) or "\\" in photo:
+        return None
+    return folder / "photos" / parts[0]
 
 
 def _read(target: str | Path) -> tuple[Path, Inspection]:
+    """The first measurement that a folder or file belongs to."""
     path = inspection_path(target)
     if not path.is_file():
         raise InputError(f"{path}: no such inspection; give a job folder or an inspection.json")
-    return path, load_inspection(path)
+    first = first_inspection(path)
+    return first, load_inspection(first)
 
 
-def _check_photo(folder: Path, photo: object) -> None:
-    """Check that a photo is one of the folder, where the folder keeps photos."""
+def _kept_photo(path: Path, first: Path, photo: object) -> str:
+    """The name under which a photo of a folder is kept in the log of the first measurement, checked."""
     name = checked_name(photo, "photo")
     if "/" in name or "\\" in name or name.startswith("."):
         raise InputError(f"photo: {name!r} is not the name of a photo")
-    photos = folder / "photos"
+    photos = path.parent / "photos"
     if photos.is_dir() and not (photos / name).is_file():
         raise InputError(f"photo: there is no {name} in {photos}")
+    return name if path.resolve() == first.resolve() else f"{_RECHECK}/{path.resolve().parent.name}/{name}"

@@ -11,7 +11,7 @@ import fcntl
 import hashlib
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -102,13 +102,14 @@ class DecisionLog:
         )  # fmt: skip
         return self._append(entry)
 
-    def sign(self, by: str, note: str = "", inspection_sha256: str = "") -> Decision:
+    def sign(self, by: str, note: str = "", inspection_sha256: str = "", rechecks: Sequence[str] = ()) -> Decision:
         """Add a signature.
 
         Args:
             by: who signs.
             note: free text.
             inspection_sha256: fingerprint of the inspection that is signed, see `fingerprint_of_file`.
+            rechecks: those of the checks of reworked components that belong to it, in their order.
 
         Raises:
             InputError: as `decide`; or there is no fingerprint.
@@ -119,6 +120,7 @@ class DecisionLog:
         entry = Decision(
             number=0, kind="signature", time=_now(), by=checked_name(by, "by"),
             note=checked_text(note, "note"), inspection_sha256=_checked_hash(inspection_sha256),
+            rechecks=tuple(_checked_hash(one) for one in rechecks),
         )  # fmt: skip
         return self._append(entry)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from datetime import datetime
 from typing import Any
 
 from arview.decisions.entry import Decision, decision_document, stamp
@@ -31,6 +32,30 @@ class Signature:
 
 
 @dataclass(frozen=True)
+class Recheck:
+    """Components that were measured again after their rework.
+
+    Attributes:
+        sha256: fingerprint of the inspection that holds them.
+        created: time of the measurement, UTC.
+        components: those that were checked.
+    """
+
+    sha256: str
+    created: datetime
+    components: tuple[ComponentDeviation, ...]
+
+
+@dataclass(frozen=True)
+class CheckedAgain:
+    """A component at the first measurement and at its newest check."""
+
+    before: ComponentDeviation
+    after: ComponentDeviation
+    created: datetime
+
+
+@dataclass(frozen=True)
 class RecordState:
     """The decisions of people about one inspection.
 
@@ -41,7 +66,8 @@ class RecordState:
         accepted: decisions that take a component that did not pass.
         rejected: decisions that do not take a component.
         undecided: components that did not pass and that nobody decided about.
-        earlier: decisions that were made about an earlier inspection.
+        earlier: decisions about an earlier measurement of the component, which no longer count.
+        rechecked: components that were measured again after their rework; what counts is their newest measurement.
         faults: what was changed in the log; with any of them nothing is released.
         notices: remarks on the log that are no faults.
     """
@@ -53,34 +79,57 @@ class RecordState:
     rejected: tuple[Decision, ...] = ()
     undecided: tuple[str, ...] = ()
     earlier: tuple[Decision, ...] = ()
+    rechecked: tuple[CheckedAgain, ...] = ()
     faults: tuple[str, ...] = ()
     notices: tuple[str, ...] = ()
 
 
-def record_state(inspection: Inspection, sha256: str, content: LogContent) -> RecordState:
+def record_state(
+    inspection: Inspection, sha256: str, content: LogContent, rechecks: Sequence[Recheck] = ()
+) -> RecordState:
     """What a log of decisions says of an inspection.
 
     Args:
         inspection: the inspection.
         sha256: its fingerprint, see `fingerprint_of_file`.
         content: of the log.
+        rechecks: checks of reworked components, in their order.
     """
-    latest = {one.component: one for one in content.entries if one.kind == "decision"}
-    passed = {one.name for one in inspection.components if one.verdict in (Verdict.PASS, Verdict.MEASURED)}
+    newest = {one.name: one for one in inspection.components}
+    measured = dict.fromkeys(newest, 0)
+    created = dict.fromkeys(newest, inspection.created)
+    for place, check in enumerate(rechecks, 1):
+        for one in check.components:
+            if one.name in newest:
+                newest[one.name], measured[one.name], created[one.name] = one, place, check.created
+    places = {one: place for place, one in enumerate([sha256, *(check.sha256 for check in rechecks)])}
+    made = {one.component: one for one in content.entries if one.kind == "decision"}
+    # A decision is about one measurement: a newer one of its component has to be decided about anew.
+    latest = {
+        name: one
+        for name, one in made.items()
+        if not one.inspection_sha256 or places.get(one.inspection_sha256, -1) >= measured.get(name, 0)
+    }
+    passed = {name for name, one in newest.items() if one.verdict in (Verdict.PASS, Verdict.MEASURED)}
     accepted = tuple(one for name, one in latest.items() if one.is_ok and name not in passed)
     rejected = tuple(one for one in latest.values() if not one.is_ok)
-    undecided = [one for one in inspection.components if one.name not in passed and one.name not in latest]
-    signature = _signature(content.entries, sha256)
+    undecided = [one for name, one in newest.items() if name not in passed and name not in latest]
+    signature = _signature(content.entries, sha256, tuple(check.sha256 for check in rechecks))
     holds = signature is not None and not signature.void and not content.faults
     is_released = holds and not rejected and not undecided
+    checked = tuple(
+        CheckedAgain(one, newest[one.name], created[one.name]) for one in inspection.components if measured[one.name]
+    )
+    tail = _tail(inspection, accepted, () if is_released else rejected, () if is_released else undecided, checked)
     return RecordState(
-        sentence=_sentence(inspection, content, signature, accepted, rejected, undecided, is_released),
+        sentence=_sentence(content, signature, is_released, tail),
         is_released=is_released,
         signature=signature,
         accepted=accepted,
         rejected=rejected,
         undecided=tuple(one.name for one in undecided),
-        earlier=tuple(one for one in latest.values() if one.inspection_sha256 not in ("", sha256)),
+        earlier=tuple(one for name, one in made.items() if name not in latest),
+        rechecked=checked,
         faults=content.faults,
         notices=content.notices,
     )
@@ -97,12 +146,13 @@ def state_document(state: RecordState) -> dict[str, Any]:
         "rejected": [one.component for one in state.rejected],
         "undecided": list(state.undecided),
         "earlier": [one.component for one in state.earlier],
+        "rechecked": [one.after.name for one in state.rechecked],
         "faults": list(state.faults),
         "notices": list(state.notices),
     }
 
 
-def _signature(entries: Sequence[Decision], sha256: str) -> Signature | None:
+def _signature(entries: Sequence[Decision], sha256: str, rechecks: tuple[str, ...]) -> Signature | None:
     """The last signature, and why it does not hold."""
     places = [place for place, one in enumerate(entries) if one.kind == "signature"]
     if not places:
@@ -115,33 +165,36 @@ def _signature(entries: Sequence[Decision], sha256: str) -> Signature | None:
         return Signature(signed, f"{word} on {names} came after it")
     if signed.inspection_sha256 != sha256:
         return Signature(signed, "the inspection is another than the one that was signed")
+    if signed.rechecks != rechecks:
+        return Signature(signed, "components were checked again after it, or their checks have changed")
     return Signature(signed)
 
 
-def _sentence(
-    inspection: Inspection, content: LogContent, signature: Signature | None, accepted: Sequence[Decision],
-    rejected: Sequence[Decision], undecided: Sequence[ComponentDeviation], is_released: bool,
-) -> str:  # fmt: skip
+def _sentence(content: LogContent, signature: Signature | None, is_released: bool, tail: Sequence[str]) -> str:
     if content.faults:
         return "not valid: the log of decisions was changed after it was written"
     if not content.entries:
         return ""
+    parts = ", ".join(tail)
     if signature is None:
-        return f"not signed{_tail(': ', inspection, accepted, rejected, undecided)}"
+        return f"not signed: {parts}" if parts else "not signed"
     who = f"{signature.entry.by}, {stamp(signature.entry.time)[:16].replace('T', ' ')} UTC"
     if signature.void:
         return f"the signature of {who}, is void: {signature.void}"
     if is_released:
-        return f"released by {who}{_tail(', with ' if accepted else ', ', inspection, accepted, (), ())}"
-    return f"signed by {who}, not released{_tail(': ', inspection, accepted, rejected, undecided)}"
+        return f"released by {who}, with {parts}" if parts else f"released by {who}"
+    return f"signed by {who}, not released: {parts}"
 
 
 def _tail(
-    lead: str, inspection: Inspection, accepted: Sequence[Decision], rejected: Sequence[Decision],
-    undecided: Sequence[ComponentDeviation],
-) -> str:  # fmt: skip
-    """What was accepted, rejected and left open, after a lead; empty if there is nothing to say."""
+    inspection: Inspection, accepted: Sequence[Decision], rejected: Sequence[Decision],
+    undecided: Sequence[ComponentDeviation], checked: Sequence[CheckedAgain],
+) -> list[str]:  # fmt: skip
+    """What was put right, accepted, rejected and left open."""
     parts = []
+    right = [one.after.name for one in checked if one.after.verdict is Verdict.PASS]
+    if right:
+        parts.append(f"{', '.join(right)} in tolerance after rework")
     if accepted:
         reasons = "; ".join(f"{one.component}: {one.reason or 'no reason given'}" for one in accepted)
         parts.append(f"{len(accepted)} deviation{'s' * (len(accepted) > 1)} accepted ({reasons})")
@@ -152,7 +205,7 @@ def _tail(
     if inspection.foreign_objects:
         count = len(inspection.foreign_objects)
         parts.append(f"{count} foreign object{'s' * (count > 1)} on the part")
-    return f"{lead}{', '.join(parts)}" if parts else ""
+    return parts
 
 
 def _why_open(one: ComponentDeviation) -> str:

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
-from datetime import datetime
+from collections.abc import Callable, Mapping, Sequence
+from datetime import UTC, datetime
 from typing import Any
 
 from arview.decisions import Decision, RecordState, record_state
 from arview.decisions.entry import FIRST, line_of, stamp
 from arview.decisions.log import LogContent
+from arview.decisions.record import Recheck
+from arview.inspection import Verdict
 from arview.inspection.document import from_document
 
 
@@ -40,7 +42,7 @@ def _row(result_id: int, one: Decision) -> dict[str, Any]:
         "component": one.component, "is_ok": None if one.is_ok is None else int(one.is_ok), "reason": one.reason,
         "note": one.note, "photo": one.photo, "step": one.step,
         "is_done": None if one.is_done is None else int(one.is_done), "inspection_sha256": one.inspection_sha256,
-        "previous": one.previous, "sha256": one.sha256,
+        "rechecks": " ".join(one.rechecks), "previous": one.previous, "sha256": one.sha256,
     }  # fmt: skip
 
 
@@ -50,7 +52,8 @@ def decision_of_row(row: Any) -> Decision:
         number=int(row.number), kind=row.kind, time=datetime.fromisoformat(row.time), by=row.by,
         component=row.component, is_ok=None if row.is_ok is None else bool(row.is_ok), reason=row.reason,
         note=row.note, photo=row.photo, step=row.step, is_done=None if row.is_done is None else bool(row.is_done),
-        inspection_sha256=row.inspection_sha256, previous=row.previous, sha256=row.sha256,
+        inspection_sha256=row.inspection_sha256, rechecks=tuple(row.rechecks.split()), previous=row.previous,
+        sha256=row.sha256,
     )  # fmt: skip
 
 
@@ -68,13 +71,27 @@ def decided_faults(entries: Sequence[Decision]) -> list[str]:
     return faults
 
 
-def stored_state(document: str, content_hash: str, entries: Sequence[Decision]) -> RecordState:
+def stored_state(
+    document: str, content_hash: str, entries: Sequence[Decision], find: Callable[[str], str | None]
+) -> RecordState:
     """What the decisions say of a stored result.
 
     Args:
         document: its inspection, as JSON.
         content_hash: its hash.
         entries: about it.
+        find: the document of another result by its hash, for the checks of reworked components that were signed.
     """
     content = LogContent(entries=tuple(entries), faults=tuple(decided_faults(entries)))
-    return record_state(from_document(json.loads(document)), content_hash, content)
+    signed = [one for one in entries if one.kind == "signature"]
+    rechecks = [_recheck(sha256, find(sha256)) for sha256 in (signed[-1].rechecks if signed else ())]
+    return record_state(from_document(json.loads(document)), content_hash, content, rechecks)
+
+
+def _recheck(sha256: str, document: str | None) -> Recheck:
+    """A check of reworked components; without any if the store does not have it."""
+    if document is None:
+        return Recheck(sha256, datetime.fromtimestamp(0.0, UTC), ())
+    inspection = from_document(json.loads(document))
+    measured = tuple(one for one in inspection.components if one.verdict is not Verdict.NOT_MEASURED)
+    return Recheck(sha256, inspection.created, measured)

@@ -9,7 +9,6 @@ from typing import Any
 
 from arview.decisions import Decision
 from arview.decisions.table import decision_word
-from arview.history.decided import stored_state
 from arview.history.store import HistoryStore, StoredResult
 from arview.inspection.rounding import decimals_beside_limit, decimals_of, exact, fixed
 
@@ -68,7 +67,7 @@ def _decided(one: Decision | None) -> list[str]:
 
 def record_sentence(store: HistoryStore, one: StoredResult, entries: Sequence[Decision]) -> str:
     """What people decided about a stored result, in words."""
-    return stored_state(store.find(one.content_hash)[1], one.content_hash, entries).sentence
+    return store.state(one, entries).sentence
 
 
 def to_json_lines(store: HistoryStore, found: Sequence[StoredResult]) -> bytes:

@@ -28,10 +28,10 @@ from sqlalchemy.exc import (
     SQLAlchemyError,
 )
 
-from arview.decisions import Decision, log_of
+from arview.decisions import Decision, RecordState, log_of
 from arview.errors import InputError, MissingDependencyError, OutputError
 from arview.history.connection import BUSY_S, begin_sqlite, file_system, prepare_sqlite, store_url
-from arview.history.decided import decided_faults, decision_of_row, new_rows
+from arview.history.decided import decided_faults, decision_of_row, new_rows, stored_state
 from arview.history.tables import STORE_VERSION, about, components, decisions, guards, metadata, results, voids
 from arview.inspection import Inspection, load_inspection
 from arview.inspection.fingerprint import content_hash
@@ -317,6 +317,17 @@ class HistoryStore:
             raise InputError(f"{self.name}: more than one result begins with {key}; give more digits")
         return _listed(rows[0], voided), str(rows[0].document)
 
+    def state(self, result: StoredResult, entries: Sequence[Decision]) -> RecordState:
+        """What decisions about a result say of it together; see `decided`."""
+
+        def find(sha256: str) -> str | None:
+            with self._begin() as connection:
+                query = sa.select(results.c.document).where(results.c.content_hash == sha256)
+                found = connection.scalar(query)
+                return None if found is None else str(found)
+
+        return stored_state(find(result.content_hash) or "", result.content_hash, entries, find)
+
     def components(self, ids: list[int] | None = None, name: str | None = None) -> Iterator[dict[str, Any]]:
         """Rows of the components of results, all or those of one name, in the order of ``ids`` or of the numbers."""
         query = sa.select(components).order_by(components.c.result_id, components.c.name)
@@ -359,14 +370,9 @@ class HistoryStore:
                     faults.append(f"result {row.id}: its document does not have the hash {row.content_hash[:12]}…")
                 elif len(document["components"]) != of_result.get(row.id, 0):
                     faults.append(f"result {row.id}: its number of components has changed")
-        for number, entries in self.decided(range(1, 1 + self._last())).items():
+        for number, entries in self.decided(list(of_result)).items():
             faults += [f"result {number}: {fault}" for fault in decided_faults(entries)]
         return count, faults
-
-    def _last(self) -> int:
-        """The highest number of a result."""
-        with self._begin() as connection:
-            return int(connection.scalar(sa.select(sa.func.max(results.c.id))) or 0)
 
     # ---- connections
 

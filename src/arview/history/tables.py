@@ -71,6 +71,7 @@ decisions = Table(
     Column("step", Integer),
     Column("is_done", Integer),
     Column("inspection_sha256", String(64), nullable=False),
+    Column("rechecks", Text, nullable=False),  # fingerprints, with spaces between them
     Column("previous", String(64), nullable=False),  # hash of the line before it
     Column("sha256", String(64), nullable=False),  # hash of its line, see arview.decisions.log
 )

@@ -14,11 +14,13 @@ from markupsafe import Markup
 
 from arview.core.atomic import write_file
 from arview.decisions import Decision, RecordState, log_of, state_of_record
+from arview.decisions.folder import first_inspection, photo_path, rechecks_of
 from arview.decisions.table import decision_word
 from arview.errors import InputError
-from arview.inspection import load_inspection
+from arview.inspection import ComponentDeviation, load_inspection
 from arview.inspection.fingerprint import fingerprint_of_file
 from arview.report.evidence import ReportEvidence
+from arview.report.formatting import short_text, verdict_word
 from arview.report.rework import embedded_picture
 
 _PARTS = ("record", "decisions")
@@ -66,6 +68,23 @@ def update_report(html: str | Path, inspection: str | Path) -> bool:
     return True
 
 
+def update_reports(target: str | Path) -> tuple[Path, ...]:
+    """Put the decisions, as they are now, into every ``report.html`` of a record: the first one and those of checks.
+
+    Args:
+        target: job folder or inspection, also that of a check.
+
+    Returns:
+        the reports that could not be updated and have to be written again.
+
+    Raises:
+        InputError, OutputError: as `update_report`.
+    """
+    first = first_inspection(target)
+    found = [(path.with_name("report.html"), path) for path in (first, *(path for path, _ in rechecks_of(first)))]
+    return tuple(page for page, path in found if page.is_file() and not update_report(page, path))
+
+
 def _marks(name: str) -> tuple[str, str]:
     return f"<!-- arview {name} -->", f"<!-- arview {name} end -->"
 
@@ -78,15 +97,33 @@ def _rendered(source: Path, state: RecordState) -> dict[str, Any]:
     module: Any = environment.from_string(text).module
     entries = log_of(source).entries()
     rows = [_row(one, source) for one in entries if one.kind != "tick"]
-    made = {"record": module.record(state), "decisions": module.section(state, rows, _ticks(entries))}
+    made = {"record": module.record(state), "decisions": module.section(state, rows, _ticks(entries), _checked(state))}
     return {f"{name}_html": Markup("").join((Markup(_marks(name)[0]), made[name], Markup(_marks(name)[1])))
             for name in _PARTS}  # fmt: skip
+
+
+def _checked(state: RecordState) -> list[dict[str, str]]:
+    """Components before and after their rework."""
+    return [
+        {
+            "component": one.after.name,
+            "before": _value(one.before),
+            "after": _value(one.after),
+            "time": one.created.strftime("%Y-%m-%d %H:%M UTC"),
+        }
+        for one in state.rechecked
+    ]
+
+
+def _value(one: ComponentDeviation) -> str:
+    return verdict_word(one) if one.distance_mm is None else f"{verdict_word(one)}, {short_text(one)}"
 
 
 def _row(one: Decision, source: Path) -> dict[str, Any]:
     picture = None
     if one.photo:
-        picture = embedded_picture(source.parent / "photos" / Path(one.photo).name, _THUMBNAIL_PX)
+        path = photo_path(source, one.photo)
+        picture = None if path is None else embedded_picture(path, _THUMBNAIL_PX)
     return {
         "time": one.time.strftime("%Y-%m-%d %H:%M:%S UTC"),
         "what": "signed" if one.kind == "signature" else one.component,
