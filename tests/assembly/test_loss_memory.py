@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from arview.assembly.loss_memory import LossMemory, LossMemoryOptions
+from arview.assembly.loss_memory import KnownBefore, LossMemory, LossMemoryOptions
 from arview.assembly.monitor import AssemblyMonitor
 from arview.assembly.turned_poses import Turn, TurnEvidence
 from arview.geometry import Array, exp_so3, rigid
@@ -98,7 +98,7 @@ def test_a_bare_base_is_found_as_it_lay_before_a_short_loss() -> None:
     turned, nothing = known_bare()._turned, TurnEvidence(np.zeros(len(NAMES)), 0.8)
     half = upright(monitor()).model_from_model
     memory = LossMemory(LossMemoryOptions())
-    memory.set_aside(monitor()._state, frozenset(), POSE, True)
+    memory.set_aside(KnownBefore(monitor()._state, frozenset(), frozenset(), True), POSE)
     best = turned.best(POSE @ half, lambda pose: nothing, lambda pose: memory.is_as_before(pose, 4))
     assert np.allclose(best, POSE, atol=1e-6)
     best = turned.best(POSE @ half, lambda pose: nothing, lambda pose: memory.is_as_before(pose, BRIEF + 1))
@@ -115,9 +115,10 @@ def test_a_bare_base_is_found_as_it_lay_before_a_short_loss() -> None:
 
 def test_how_the_part_lay_is_unknown_without_a_pose_before_the_loss() -> None:
     memory = LossMemory(LossMemoryOptions())
-    memory.set_aside(monitor()._state, frozenset({0}), None, True)
+    known = KnownBefore(monitor()._state, frozenset({0}), frozenset({0, 1}), True)
+    memory.set_aside(known, None)
     assert not memory.is_as_before(POSE, 1)
     assert memory.still_known(POSE, 1) == (frozenset(), False)
-    memory.set_aside(monitor()._state, frozenset({0}), POSE, True)
+    memory.set_aside(known, POSE)
     tilted = POSE @ rigid(exp_so3([0.0, 0.0, np.deg2rad(30.0)]), np.zeros(3))
     assert memory.still_known(tilted, 1) == (frozenset({0}), True)

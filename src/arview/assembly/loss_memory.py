@@ -36,11 +36,15 @@ class KnownBefore(NamedTuple):
 
     Attributes:
         state: of the components.
-        ruled_out: indices of the turns that had been ruled out.
+        excluded: indices of the turns that pictures had excluded.
+        ruled_out: these, and those that components seen at their places leave out.
+        is_placed: whether the pose was known to be that of the part.
     """
 
     state: MonitorState
+    excluded: frozenset[int]
     ruled_out: frozenset[int]
+    is_placed: bool
 
 
 class LossMemory:
@@ -54,24 +58,14 @@ class LossMemory:
         self._options = options
         self.aside: MonitorState | None = None
         self._last_pose: Array | None = None
-        self._ruled_out: frozenset[int] = frozenset()
-        self._was_placed = False
+        self._known: KnownBefore | None = None
         self._surest: KnownBefore | None = None
 
-    def set_aside(
-        self, state: MonitorState, ruled_out: frozenset[int], last_pose: Array | None, was_placed: bool
-    ) -> None:
-        """Keep a state.
-
-        Args:
-            state: of the components.
-            ruled_out: indices of the turns that nothing leaves open.
-            last_pose: (4,4) the last that the picture supported; None: not known.
-            was_placed: whether the pose was known to be that of the part.
-        """
-        self.aside, self._ruled_out, self._last_pose, self._was_placed = state, ruled_out, last_pose, was_placed
-        if self._surest is None or ruled_out >= self._surest.ruled_out:
-            self._surest = KnownBefore(state, ruled_out)
+    def set_aside(self, known: KnownBefore, last_pose: Array | None) -> None:
+        """Keep what is known, and the last pose (4,4) that the picture supported; None: there is none."""
+        self.aside, self._known, self._last_pose = known.state, known, last_pose
+        if self._surest is None or known.ruled_out >= self._surest.ruled_out:
+            self._surest = known
 
     def is_as_before(self, cam_from_model: Array, frames_lost: int) -> bool:
         """Whether a part found at a pose (4,4) after some frames without one is turned as it was."""
@@ -84,11 +78,11 @@ class LossMemory:
         """What still holds of a part found at a pose (4,4), see `is_as_before`.
 
         Returns:
-            indices of the turns that stay ruled out, and whether the pose is known to be that of the part.
+            indices of the turns that stay excluded, and whether the pose is known to be that of the part.
         """
-        if not self.is_as_before(cam_from_model, frames_lost):
+        if self._known is None or not self.is_as_before(cam_from_model, frames_lost):
             return frozenset(), False
-        return self._ruled_out, self._was_placed
+        return self._known.excluded, self._known.is_placed
 
     def before_turn(self, turn: int) -> MonitorState | None:
         """The state before the loss, after which the part was found turned; None if it may have been so before."""

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arview.assembly.direction_evidence import DirectionEvidence, DirectionOptions
-from arview.assembly.loss_memory import LossMemory, LossMemoryOptions
+from arview.assembly.loss_memory import KnownBefore, LossMemory, LossMemoryOptions
 from arview.assembly.monitor_state import MonitorState
 from arview.assembly.observation import ComponentObserver, Known, Observation, ObservationOptions, base_of
 from arview.assembly.present_lines import PresentLines
@@ -201,8 +201,8 @@ class AssemblyMonitor:
     def set_aside(self, last_pose: Array | None = None) -> None:
         """Keep what is known while the part is lost, for `resume`; the last pose (4,4) that was supported, if known."""
         if self._state.observations:
-            ruled_out = self._turned.ruled_out(self._state.is_verified)
-            self._memory.set_aside(self._state, ruled_out, last_pose, self.is_placed)
+            excluded, ruled_out = self._turned.excluded, self._turned.ruled_out(self._state.is_verified)
+            self._memory.set_aside(KnownBefore(self._state, excluded, ruled_out, self.is_placed), last_pose)
 
     def resume(self, cam_from_model: Array | None = None, frames_lost: int = 0) -> None:
         """Take up what was known before the part was lost: the same specimen was found again.
@@ -219,8 +219,8 @@ class AssemblyMonitor:
         self._state = before.followed_by(now, share, o.max_log_odds, o.cleared_log_odds)
         self._is_resumed = True
         if cam_from_model is not None:
-            ruled_out, was_placed = self._memory.still_known(cam_from_model, frames_lost)
-            self._turned.exclude(ruled_out)
+            excluded, was_placed = self._memory.still_known(cam_from_model, frames_lost)
+            self._turned.exclude(excluded)
             self.is_placed |= was_placed
 
     def forget(self) -> None:

@@ -149,6 +149,11 @@ class TurnedPoses:
         is_open = {self.index_of(turn) for turn in self.open_turns(is_present)}
         return frozenset(range(len(self.turns))) - is_open
 
+    @property
+    def excluded(self) -> frozenset[int]:
+        """Indices of the turns that pictures have excluded."""
+        return frozenset(self._excluded)
+
     def exclude(self, turns: frozenset[int]) -> None:
         """Exclude turns by their indices: it is known that the part is not turned so."""
         self._excluded |= turns
