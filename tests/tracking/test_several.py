@@ -134,6 +134,38 @@ def test_specimens_are_told_apart_by_their_place() -> None:
     assert is_same_specimen(left, moved, views())
 
 
+class ScriptedSession(TrackingSession):
+    """A session that is tracked from the first frame on, or finds nothing; it counts its frames."""
+
+    def __init__(self, is_found: bool) -> None:
+        super().__init__(views(), two_specimens.wide_camera(), load_part(str(PART)).model)
+        self.is_found, self.calls = is_found, 0
+
+    @property
+    def has_pose(self) -> bool:
+        return self.is_found and self.calls > 0
+
+    def process(self, image: Image, index: int, time_s: float) -> Pose:
+        self.calls += 1
+        state = TrackingState.TRACKED if self.is_found else TrackingState.SEARCHING
+        return Pose(np.eye(4) if self.is_found else None, None, 1.0, state, time_s, index)
+
+
+@pytest.mark.slow
+def test_a_part_that_is_not_found_is_soon_searched_for_in_every_third_frame_only() -> None:
+    found, missing = ScriptedSession(True), ScriptedSession(False)
+    several = SeveralSessions({"found": found, "missing": missing})
+    image = two_specimens.frames()[0][0]
+    searched = []
+    for index in range(36):
+        before = missing.calls
+        several.process(image, index, index / 30.0)
+        searched.append(missing.calls > before)
+    assert found.calls == 36
+    assert not searched[0] and all(searched[1:6]), "one search a frame, and at first in every one"
+    assert 9 <= sum(searched[6:]) <= 11
+
+
 def test_sessions_of_different_cameras_are_refused() -> None:
     model, camera = load_part(str(PART)).model, two_specimens.wide_camera()
     other = camera.scaled(camera.width // 2, camera.height // 2)

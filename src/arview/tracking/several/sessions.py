@@ -34,7 +34,7 @@ class SeveralSessions:
         InputError: no session, or sessions of different cameras.
     """
 
-    def __init__(self, sessions: Mapping[str, TrackingSession], search_every: int = 3, eager_frames: int = 15) -> None:
+    def __init__(self, sessions: Mapping[str, TrackingSession], search_every: int = 3, eager_frames: int = 6) -> None:
         if not sessions:
             raise InputError("several parts: no session given")
         first = next(iter(sessions.values()))
