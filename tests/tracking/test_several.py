@@ -171,5 +171,10 @@ def test_sessions_of_different_cameras_are_refused() -> None:
     other = camera.scaled(camera.width // 2, camera.height // 2)
     with pytest.raises(InputError, match="same camera"):
         SeveralSessions({"a": TrackingSession(views(), camera, model), "b": TrackingSession(views(), other, model)})
+    # Read twice it is the same camera.
+    again = replace(camera, dist=np.array(camera.dist))
+    assert again is not camera
+    both = {"a": TrackingSession(views(), camera, model), "b": TrackingSession(views(), again, model)}
+    assert len(SeveralSessions(both).sessions) == 2
     with pytest.raises(InputError, match="no session"):
         SeveralSessions({})

@@ -9,7 +9,7 @@ rarely while others are tracked, so that a frame takes about as long as with one
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import fields, is_dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,7 +38,7 @@ class SeveralSessions:
         if not sessions:
             raise InputError("several parts: no session given")
         first = next(iter(sessions.values()))
-        if any(one.frames.camera != first.frames.camera for one in sessions.values()):
+        if not all(is_equal(one.frames.camera, first.frames.camera) for one in sessions.values()):
             raise InputError("several parts: the sessions have different cameras; make them all for the same camera")
         self.sessions = dict(sessions)
         self._search_every, self._eager_frames = search_every, eager_frames
@@ -130,3 +130,12 @@ class SeveralSessions:
                         self._waiting(name, last.index, last.time_s), ms=last.ms, reason=session.reason
                     )
                     break
+
+
+def is_equal(one: object, other: object) -> bool:
+    """Whether two cameras have the same values; arrays in dataclasses cannot be compared by ``==``."""
+    if one is other:
+        return True
+    if is_dataclass(one) and is_dataclass(other) and type(one) is type(other):
+        return all(is_equal(getattr(one, of.name), getattr(other, of.name)) for of in fields(one))
+    return bool(np.array_equal(np.asarray(one), np.asarray(other)))
