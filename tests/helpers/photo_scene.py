@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import cv2
@@ -45,11 +46,19 @@ def ring(count: int, distance_mm: float = 520.0, elevations_deg: tuple[float, ..
 
 
 def photograph(
-    model: Model, cam_from_model: Array, camera: Camera = CAMERA, seed: int = 0, noise: float = 2.0
-) -> Picture:
-    """The picture of a model, (H,W,3) uint8: twice the size, then through the lens, with noise."""
+    model: Model, cam_from_model: Array, camera: Camera = CAMERA, seed: int = 0, noise: float = 2.0,
+    moves: Mapping[str, Array] | None = None,
+) -> Picture:  # fmt: skip
+    """The picture of a model, (H,W,3) uint8: twice the size, then through the lens, with noise.
+
+    Components are taken along by ``moves`` (4,4), and their texture with them.
+    """
     twice = camera.without_distortion().scaled(2 * camera.width, 2 * camera.height)
-    parts = [(component.vertices_in_model, component.faces) for component in model.components]
+    places = [(moves or {}).get(component.name, np.eye(4)) for component in model.components]
+    parts = [
+        (apply(place, component.vertices_in_model), component.faces)
+        for place, component in zip(places, model.components, strict=True)
+    ]
     starts = np.cumsum([0, *(len(vertices) for vertices, _ in parts)])
     vertices = np.concatenate([vertices for vertices, _ in parts])
     faces = np.concatenate([faces + start for (_, faces), start in zip(parts, starts, strict=False)])
@@ -60,6 +69,10 @@ def photograph(
     rays = np.stack([(columns - twice.cx) / twice.fx, (rows - twice.cy) / twice.fy, np.ones(columns.shape)], -1)
     hit = face >= 0
     points = apply(invert(cam_from_model), rays[hit] / inverse_depth[hit][:, None])
+    owner = np.repeat(np.arange(len(parts)), [len(faces) for _, faces in parts])[face[hit]]
+    texture = np.empty_like(points)
+    for i, place in enumerate(places):
+        texture[owner == i] = apply(invert(place), points[owner == i])
     corners = vertices[faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
@@ -67,7 +80,7 @@ def photograph(
     grey = np.full(face.shape, 30.0)
     tones = {"bench": 0.45, "plate": 1.25}
     tone = np.concatenate([np.full(len(one.faces), tones.get(one.name, 0.8)) for one in model.components])
-    grey[hit] = _texture(points, seed) * (light * tone)[face[hit]]
+    grey[hit] = _texture(texture, seed) * (light * tone)[face[hit]]
     small = cv2.resize(grey, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
     through = _through_lens(small, camera)
     through += np.random.default_rng(int(abs(cam_from_model[:3].sum()) * 1e3) + seed).normal(0.0, noise, through.shape)

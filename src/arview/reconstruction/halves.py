@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from arview.errors import CannotMeasureError
-from arview.geometry import rigid
+from arview.geometry import Array, rigid
 from arview.reconstruction.colmap import import_pycolmap, read_reconstruction, sparse_model_of
 from arview.reconstruction.covariance import pose_covariance
 from arview.reconstruction.groups import linked_groups
@@ -82,7 +82,7 @@ def adjusted_alone(
     sparse = replace(sparse, pose_covariance=pose_covariance(sparse, model, adjuster))
     if len(linked_groups(sparse, options.groups)) > 1:
         raise CannotMeasureError(f"{named} are not placed without the others")
-    return _onto(sparse, whole)
+    return sparse.transformed(*onto(sparse, whole))
 
 
 def _listed(photo: PosedPhoto) -> Photo:
@@ -92,14 +92,18 @@ def _listed(photo: PosedPhoto) -> Photo:
     )  # fmt: skip
 
 
-def _onto(sparse: SparseModel, whole: SparseModel) -> SparseModel:
-    """The model in the frame and unit of another one, by the centres of the photos of both (Umeyama 1991)."""
+def onto(sparse: SparseModel, whole: SparseModel) -> tuple[float, Array]:
+    """Scale and rigid motion (4,4) that bring a model onto another one, by the centres of the photos of both.
+
+    Umeyama 1991.
+    """
     target = {photo.name: photo.centre_in_scan for photo in whole.photos}
-    ours = np.array([photo.centre_in_scan for photo in sparse.photos])
-    theirs = np.array([target[photo.name] for photo in sparse.photos])
+    common = [photo for photo in sparse.photos if photo.name in target]
+    ours = np.array([photo.centre_in_scan for photo in common])
+    theirs = np.array([target[photo.name] for photo in common])
     middle, their_middle = ours.mean(axis=0), theirs.mean(axis=0)
     u, _, vt = np.linalg.svd((theirs - their_middle).T @ (ours - middle))
     rotation = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
     turned = (ours - middle) @ rotation.T
     scale = float(np.sum(turned * (theirs - their_middle)) / np.sum(turned**2))
-    return sparse.transformed(scale, rigid(rotation, their_middle - scale * rotation @ middle))
+    return scale, rigid(rotation, their_middle - scale * rotation @ middle)

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Lock
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 
@@ -73,7 +74,7 @@ class SparseMemory:
             with np.load(path, allow_pickle=False) as content:
                 points, sums, sizes, colors = (content[name] for name in ("points", "sums", "sizes", "colors"))
             return DetectedFeatures(points, sums.astype(np.float32), sizes, colors)
-        except (OSError, ValueError, KeyError, EOFError):
+        except (OSError, ValueError, KeyError, EOFError, BadZipFile):
             return None
 
     def _write(self, key: str, found: DetectedFeatures) -> None:

@@ -244,7 +244,7 @@ class _ReconstructionRun:
             return _read_sparse(folder, photos)
         self._restart("sparse")
         sparse = self._placed(photos, folder)
-        _write_sparse(folder, sparse)
+        write_sparse(folder, sparse)
         self.stages.finish("sparse", key)
         self._record_time("sparse", began)
         return sparse
@@ -305,7 +305,7 @@ class _ReconstructionRun:
 # --- files -----------------------------------------------------------------------------------------------
 
 
-def _write_sparse(folder: Path, sparse: SparseModel) -> None:
+def write_sparse(folder: Path, sparse: SparseModel) -> None:
     """Write what COLMAP's model, which is already in the folder, does not contain."""
     write_json(folder / "unplaced.json", dict(sparse.unplaced))
     write_json(
@@ -322,7 +322,7 @@ def _write_sparse(folder: Path, sparse: SparseModel) -> None:
 
 
 def _read_sparse(folder: Path, photos: tuple[Photo, ...]) -> SparseModel:
-    """Read what `reconstruct_sparse` and `_write_sparse` wrote. Raises InputError when files are missing."""
+    """Read what `reconstruct_sparse` and `write_sparse` wrote. Raises InputError when files are missing."""
     try:
         unplaced = json.loads((folder / "unplaced.json").read_text(encoding="utf-8"))
         groups = json.loads((folder / "groups.json").read_text(encoding="utf-8"))

@@ -25,13 +25,12 @@ from arview.errors import CannotMeasureError
 from arview.geometry import Array, invert, skew
 from arview.reconstruction.colmap import (
     CALIBRATED_MODEL,
-    HALF_PX,
-    colmap_camera,
     import_pycolmap,
     model_of_poses,
     sparse_model_of,
 )
 from arview.reconstruction.covariance import pose_covariance
+from arview.reconstruction.database import emptied, write_database, write_matches
 from arview.reconstruction.features import FeatureOptions, Features, find_all_features
 from arview.reconstruction.gpu.device import torch_device
 from arview.reconstruction.groups import GroupOptions, linked_groups
@@ -99,14 +98,14 @@ def reconstruct_sparse(
     tried, pairs = match_by_appearance(photos, features, options, threads, tell, min_move_px, known, memory)
     write_pairs(folder / "pairs.json", photos, tried)
     database_path = folder / "database.db"
-    _write_database(database_path, photos, features, pairs, options)
+    write_database(database_path, photos, features, pairs, options.min_matches, options.seed)
     models = _map(database_path, folder, options, len(photos), tell)
     if not models or max(model.num_reg_images() for model in models) < 3:
         raise CannotMeasureError("; ".join([why_nothing(photos, features, pairs), *remarks]))
     chosen = max(models, key=lambda model: (model.num_reg_images(), model.num_points3D()))
-    matches = _match_along_lines(chosen, photos, features, options, threads, tell, min_move_px)
-    _write_matches(database_path, matches)
-    chosen, adjuster = _triangulate_and_adjust(chosen, database_path, folder, options, threads, tell)
+    matches = match_all_along_lines(chosen, photos, features, options, threads, tell, min_move_px)
+    write_matches(database_path, matches)
+    chosen, adjuster = triangulate_and_adjust(chosen, database_path, folder, options, threads, tell)
     sparse, groups = _finished(chosen, adjuster, photos, features, folder, options, threads, models)
     unplaced = unplaced_photos(photos, features, pairs, groups)
     return replace(sparse, unplaced=tuple(unplaced), groups=groups, remarks=tuple(remarks))
@@ -139,12 +138,12 @@ def reconstruct_from_poses(
     photos = [photo for photo, _ in posed]
     features, remarks = moving_features(photos, options, threads, tell, SparseMemory())
     database_path = folder / "database.db"
-    _write_database(database_path, photos, features, {}, options)
+    write_database(database_path, photos, features, {}, options.min_matches, options.seed)
     model = model_of_poses(posed)
-    matches = _match_along_lines(model, photos, features, options, threads, tell)
-    _write_matches(database_path, matches)
+    matches = match_all_along_lines(model, photos, features, options, threads, tell)
+    write_matches(database_path, matches)
     try:
-        model, adjuster = _triangulate_and_adjust(model, database_path, folder, options, threads, tell)
+        model, adjuster = triangulate_and_adjust(model, database_path, folder, options, threads, tell)
         sparse, groups = _finished(model, adjuster, photos, features, folder, options, threads, [])
     except (CannotMeasureError, ValueError, RuntimeError) as error:
         raise CannotMeasureError(
@@ -166,9 +165,9 @@ def _finished(
     models: Sequence[Any],
 ) -> tuple[SparseModel, tuple[tuple[str, ...], ...]]:
     """The main group of an adjusted model, written to the folder, and the names of all groups."""
-    sparse, split = _main_group(model, adjuster, photos, options, threads)
-    _color(model, features)
-    model.write(str(_emptied(folder / "model")))
+    sparse, split = main_group(model, adjuster, photos, options, threads)
+    color_points(model, features)
+    model.write(str(emptied(folder / "model")))
     return sparse, _all_groups(sparse, split, models)
 
 
@@ -230,50 +229,6 @@ def match_by_appearance(
     return sorted(tried), {pair: found[pair] for pair in sorted(found)}
 
 
-def _write_database(
-    path: Path,
-    photos: Sequence[Photo],
-    features: Sequence[Features],
-    pairs: dict[Pair, Matches],
-    options: SparseOptions,
-) -> None:
-    """COLMAP's database; photo i has image id i + 1."""
-    pycolmap = import_pycolmap()
-    path.unlink(missing_ok=True)
-    with pycolmap.Database.open(str(path)) as database:
-        cameras: dict[str, Any] = {}
-        for index, photo in enumerate(photos):
-            if photo.lens not in cameras:
-                camera = colmap_camera(photo.camera, photo.is_calibrated)
-                camera.camera_id = database.write_camera(camera)
-                cameras[photo.lens] = camera
-                rig = pycolmap.Rig(rig_id=camera.camera_id)
-                rig.add_ref_sensor(camera.sensor_id)
-                database.write_rig(rig, use_rig_id=True)
-            camera = cameras[photo.lens]
-            image = pycolmap.Image(name=photo.name, camera_id=camera.camera_id, image_id=index + 1)
-            database.write_image(image, use_image_id=True)
-            frame = pycolmap.Frame(frame_id=index + 1, rig_id=camera.camera_id)
-            frame.add_data_id(image.data_id)
-            database.write_frame(frame, use_frame_id=True)
-            database.write_keypoints(index + 1, features[index].points_px + np.float32(HALF_PX))
-        verification = pycolmap.TwoViewGeometryOptions(min_num_inliers=options.min_matches)
-        verification.ransac.random_seed = options.seed
-        verification.ransac.max_num_trials = 2000
-        for (i, j), matches in pairs.items():
-            geometry = pycolmap.estimate_two_view_geometry(
-                cameras[photos[i].lens],
-                features[i].points_px.astype(np.float64) + HALF_PX,
-                cameras[photos[j].lens],
-                features[j].points_px.astype(np.float64) + HALF_PX,
-                matches,
-                verification,
-            )
-            if len(geometry.inlier_matches) >= options.min_matches:
-                database.write_matches(i + 1, j + 1, matches)
-                database.write_two_view_geometry(i + 1, j + 1, geometry)
-
-
 def _map(path: Path, folder: Path, options: SparseOptions, photo_count: int, tell: Progress) -> list[Any]:
     """The reconstructions that COLMAP's incremental mapper finds."""
     pycolmap = import_pycolmap()
@@ -290,7 +245,7 @@ def _map(path: Path, folder: Path, options: SparseOptions, photo_count: int, tel
     models = pycolmap.incremental_mapping(
         str(path),
         str(folder),
-        str(_emptied(folder / "mapper")),
+        str(emptied(folder / "mapper")),
         mapping,
         initial_image_pair_callback=lambda: tell("placing", 2, photo_count),
         next_image_callback=lambda: tell("placing", min(next(placed), photo_count), photo_count),
@@ -298,19 +253,10 @@ def _map(path: Path, folder: Path, options: SparseOptions, photo_count: int, tel
     return [models[key] for key in sorted(models)]
 
 
-def _emptied(folder: Path) -> Path:
-    """The folder, created if missing, without files of an earlier run."""
-    folder.mkdir(exist_ok=True)
-    for old in folder.rglob("*"):
-        if old.is_file():
-            old.unlink()
-    return folder
-
-
 # --- second pass -----------------------------------------------------------------------------------------
 
 
-def _match_along_lines(
+def match_all_along_lines(
     model: Any,
     photos: Sequence[Photo],
     features: Sequence[Features],
@@ -318,9 +264,12 @@ def _match_along_lines(
     threads: int,
     tell: Progress,
     min_move_px: float = 0.0,
+    memory: SparseMemory | None = None,
 ) -> dict[Pair, Matches]:
     """All features of placed photos matched again, now that the relative poses are known."""
-    cameras, poses = _cameras_and_poses(model, photos)
+    memory = memory or SparseMemory()
+    prints = feature_prints(features)
+    cameras, poses = cameras_and_poses(model, photos)
     rays = {
         index: np.ascontiguousarray(camera.unproject(features[index].points_px)[:, :2])
         for index, camera in cameras.items()
@@ -334,8 +283,14 @@ def _match_along_lines(
         essential = skew(second_from_first[:3, 3]) @ second_from_first[:3, :3]
         focal = 0.5 * (cameras[i].fx + cameras[j].fx)
         pair_of = (features[i], features[j])
-        matches = match_along_lines((rays[i], rays[j]), focal, pair_of, essential, options.band_px, device)
-        return moved_matches(*pair_of, matches, min_move_px)
+
+        def find() -> Matches:
+            matches = match_along_lines((rays[i], rays[j]), focal, pair_of, essential, options.band_px, device)
+            return moved_matches(*pair_of, matches, min_move_px)
+
+        lenses = tuple((c.fx, c.fy, c.cx, c.cy, *c.dist.tolist()) for c in (cameras[i], cameras[j]))
+        key = (prints[i], prints[j], essential.tobytes(), lenses, options.band_px, min_move_px, device)
+        return memory.matches(key, find)
 
     chosen = pairs_in_common_view(poses)
     found: dict[Pair, Matches] = {}
@@ -346,7 +301,7 @@ def _match_along_lines(
     return found
 
 
-def _cameras_and_poses(model: Any, photos: Sequence[Photo]) -> tuple[dict[int, Camera], dict[int, Array]]:
+def cameras_and_poses(model: Any, photos: Sequence[Photo]) -> tuple[dict[int, Camera], dict[int, Array]]:
     """Camera and ``cam_from_scan`` of each placed photo, by its index."""
     sparse = sparse_model_of(model, photos)
     place = {photo.name: index for index, photo in enumerate(photos)}
@@ -354,38 +309,28 @@ def _cameras_and_poses(model: Any, photos: Sequence[Photo]) -> tuple[dict[int, C
     return cameras, {place[photo.name]: photo.cam_from_scan for photo in sparse.photos}
 
 
-def _write_matches(path: Path, pairs: dict[Pair, Matches]) -> None:
-    """Replace the matches of the first pass by those of the second."""
-    pycolmap = import_pycolmap()
-    with pycolmap.Database.open(str(path)) as database:
-        database.clear_matches()
-        database.clear_two_view_geometries()
-        for (i, j), matches in pairs.items():
-            if len(matches) == 0:
-                continue
-            geometry = pycolmap.TwoViewGeometry()
-            geometry.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
-            geometry.inlier_matches = matches
-            database.write_matches(i + 1, j + 1, matches)
-            database.write_two_view_geometry(i + 1, j + 1, geometry)
-
-
-def _triangulate_and_adjust(
-    model: Any, path: Path, folder: Path, options: SparseOptions, threads: int, tell: Progress
-) -> tuple[Any, Any]:
+def triangulate_and_adjust(
+    model: Any, path: Path, folder: Path, options: SparseOptions, threads: int, tell: Progress,
+    keeps_centre: bool = False,
+) -> tuple[Any, Any]:  # fmt: skip
     """Points triangulated from all matches; then poses, points and intrinsics adjusted together.
 
-    Returns the model and the adjuster of the last step.
+    ``keeps_centre`` leaves principal points as an earlier adjustment has found them. Returns the model and the adjuster
+    of the last step.
     """
     pycolmap = import_pycolmap()
     tell("adjusting", 0, 3)
     triangulation = pycolmap.IncrementalPipelineOptions(random_seed=options.seed, num_threads=threads)
     triangulation.triangulation.ignore_two_view_tracks = False
     model = pycolmap.triangulate_points(
-        model, str(path), str(folder), str(_emptied(folder / "triangulated")), True, triangulation
+        model, str(path), str(folder), str(emptied(folder / "triangulated")), True, triangulation
     )
     tell("adjusting", 1, 3)
-    refines_centre = adjust_with_centre(model, options, threads)
+    refines_centre = False
+    if keeps_centre:
+        adjust(model, threads, refines_centre=False, iterations=5)
+    else:
+        refines_centre = adjust_with_centre(model, options, threads)
     tell("adjusting", 2, 3)
     pycolmap.ObservationManager(model).filter_all_points3D(options.max_error_px, options.min_angle_deg)
     adjuster = adjust(model, threads, refines_centre=refines_centre)
@@ -414,7 +359,7 @@ def adjust_with_centre(model: Any, options: SparseOptions, threads: int) -> bool
     return False
 
 
-def _main_group(
+def main_group(
     model: Any, adjuster: Any, photos: Sequence[Photo], options: SparseOptions, threads: int
 ) -> tuple[SparseModel, list[list[str]]]:
     """The photos that are placed relative to each other, adjusted alone; and the names of the other groups.
@@ -460,7 +405,7 @@ def _all_groups(sparse: SparseModel, split: list[list[str]], models: Sequence[An
     return tuple(groups)
 
 
-def _color(model: Any, features: Sequence[Features]) -> None:
+def color_points(model: Any, features: Sequence[Features]) -> None:
     """Give every point the colour of the place where it was first seen."""
     for point in model.points3D.values():
         first = point.track.elements[0]

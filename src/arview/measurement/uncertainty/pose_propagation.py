@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -87,8 +87,9 @@ class PosePropagation:
     """
 
     def __init__(
-        self, sparse: SparseModel, model: Model, alignment: Alignment, base: Sequence[str], points: int = 60
-    ) -> None:
+        self, sparse: SparseModel, model: Model, alignment: Alignment, base: Sequence[str], points: int = 60,
+        used: Callable[[str | None], NDArray[np.bool_]] | None = None,
+    ) -> None:  # fmt: skip
         """Compute the derivative of scale and datum frame by the poses.
 
         Args:
@@ -97,10 +98,12 @@ class PosePropagation:
             alignment: the datum frame.
             base: components that determine the scale; empty for all.
             points: points used on each component.
+            used: which photos (M,) a component is measured in, and with None the datums; default: all of them.
         """
         if sparse.pose_covariance is None:
             raise InputError("uncertainty: the reconstruction has no covariance of its poses; reconstruct again")
         self.sparse, self.model, self.alignment, self.count = sparse, model, alignment, points
+        self.used = used or (lambda name: np.ones(len(sparse.photos), dtype=np.bool_))
         names = base or [component.name for component in model.components]
         arms, shifts = [], []
         for name in names:
@@ -141,7 +144,7 @@ class PosePropagation:
         some = np.arange(0, len(points), step)
         toward = np.mean([p.centre_in_scan for p in self.sparse.photos], axis=0) - points[some].mean(axis=0)
         facing = np.tile(toward / np.linalg.norm(toward), (len(some), 1))
-        sees = visibility(points[some], facing, self.sparse, self.model)
+        sees = visibility(points[some], facing, self.sparse, self.model) & self.used(None)
         moved = shifts_from_poses(points[some], self.sparse.photos, sees)
         apart = np.linalg.norm(points[:, None] - points[some][None], axis=2)
         apart[:, sees.sum(axis=1) < 2] = np.inf
@@ -155,7 +158,7 @@ class PosePropagation:
     def _shifts(self, component: Component) -> tuple[Array, Array]:
         """Visible points of a component, and their derivative by the poses."""
         points, normals = surface_points(component, 3 * self.count)
-        sees = visibility(points, normals, self.sparse, self.model)
+        sees = visibility(points, normals, self.sparse, self.model) & self.used(component.name)
         kept = np.flatnonzero(sees.sum(axis=1) >= 2)[: self.count]
         if len(kept) < 3:
             return points[:3], np.zeros((3, 3, 6 * len(self.sparse.photos)))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 
-from arview.workflow.walk.worker import main
+from arview.workflow.walk.process import main
 
 if __name__ == "__main__":
     sys.exit(main(sys.argv[1:]))

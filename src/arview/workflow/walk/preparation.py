@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from threading import Event, Thread
@@ -16,6 +16,7 @@ from arview.reconstruction.memory import SparseMemory
 from arview.reconstruction.pairs import KnownPairs
 from arview.reconstruction.run import reconstruct
 from arview.reconstruction.sparse import match_by_appearance, moving_features
+from arview.reconstruction.types import Photo
 from arview.workflow.prepare import Prepared
 from arview.workflow.walk.job import JobFolder
 from arview.workflow.walk.records import StoredPhoto
@@ -30,6 +31,7 @@ class PhotoPreparation:
         prepared: its inputs.
         memory: where features and matches are kept.
         threads: photos or pairs at a time.
+        also: what else is done with the usable photos.
         ready: number of photos that are worked on, in their order.
     """
 
@@ -37,6 +39,7 @@ class PhotoPreparation:
     prepared: Prepared
     memory: SparseMemory
     threads: int
+    also: Callable[[Sequence[Photo]], None]
     ready: int = 0
     _ends: Event = field(default_factory=Event)
     _thread: Thread | None = None
@@ -79,6 +82,7 @@ class PhotoPreparation:
             match_by_appearance(
                 intake.photos, features, sparse, self.threads, _nothing, min_move_px, known, self.memory
             )
+            self.also(intake.photos)
         except ArviewError:
             return  # photos that cannot be used are told of when all of them are there
 

@@ -7,28 +7,22 @@ finished stages and the features of photos are in the folder, and the rest depen
 from __future__ import annotations
 
 import os
-import signal
-import sys
 import time
 import traceback
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from pathlib import Path
-from threading import Thread
 from typing import Any
 
 from arview.core.progress import Progress
 from arview.errors import ArviewError, InputError, MismatchError
 from arview.inspection import Inspection, save_inspection
 from arview.inspection.summary import verdict_sentence
-from arview.reconstruction.colmap import import_pycolmap
-from arview.reconstruction.intake.kept import keeping_photos
 from arview.reconstruction.memory import SparseMemory
 from arview.reconstruction.pairs import KnownPairs
 from arview.reconstruction.run import reconstruct
+from arview.reconstruction.types import Photo
 from arview.workflow.job import InspectJob
-from arview.workflow.lock import exclusive_access
 from arview.workflow.prepare import Prepared, prepare
 from arview.workflow.run import Outcome, inspect_prepared, measured_in_photos
 from arview.workflow.walk.job import JobFolder
@@ -43,7 +37,7 @@ class WalkOptions:
     """Options of a measurement while photos arrive."""
 
     first_rough: int = 6  # photos of the first provisional measurement
-    rough_step: int = 3  # photos that the next provisional measurement has more
+    rough_growth: float = 2.0  # photos of the next provisional measurement, as a multiple of those of the last one
     niceness: int = 5  # of the process while the user waits …
     background_niceness: int = 15  # … and while the cloud and the report follow
 
@@ -98,7 +92,7 @@ class WalkWorker:
 
     def _collect(self, prepared: Prepared) -> None:
         """Work ahead until the walk ends, and measure roughly in between."""
-        preparation = PhotoPreparation(self.job, prepared, self.memory, self.threads)
+        preparation = PhotoPreparation(self.job, prepared, self.memory, self.threads, self._prepare_more)
         preparation.start()
         wanted = self.options.first_rough
         try:
@@ -107,11 +101,14 @@ class WalkWorker:
                 if photos != self.state.photos:
                     self._say(photos=photos, text=f"{photos} photos")
                 if preparation.ready >= wanted:
-                    wanted = preparation.ready + self.options.rough_step
+                    wanted = round(self.options.rough_growth * preparation.ready)
                     self._measure_roughly(prepared, preparation.ready)
                 time.sleep(_POLL_S)
         finally:
             preparation.end()
+
+    def _prepare_more(self, photos: Sequence[Photo]) -> None:
+        """What else is found as soon as photos arrive."""
 
     def _measure_roughly(self, prepared: Prepared, count: int) -> None:
         """A provisional measurement of the first photos; given up when the walk ends, silent when it fails."""
@@ -239,43 +236,6 @@ def prepared_of(job: JobFolder) -> Prepared:
     if prepared.part.model.source_hash != document["model_hash"]:
         raise MismatchError(f"{document['part']}: has changed since job {job.id} was made; make a new job")
     return prepared
-
-
-def main(arguments: Sequence[str]) -> int:
-    """Run the worker of a job's folder; returns the exit status."""
-    if len(arguments) != 1:
-        print("usage: python -m arview.workflow.walk JOB", file=sys.stderr)
-        return 2
-    # Files appear complete or not at all and stages are recorded when they are finished, so that the process may end
-    # at any moment. The work has a thread of its own, because signals are handled only between steps of the main one.
-    import_pycolmap()  # here, because its logging takes over the signals when it is loaded
-    signal.signal(signal.SIGTERM, lambda number, frame: os._exit(143))
-    result: list[int] = []
-    thread = Thread(target=lambda: result.append(_run(Path(arguments[0]))), name="walk", daemon=True)
-    thread.start()
-    while thread.is_alive():
-        thread.join(0.5)
-    return result[0] if result else 1
-
-
-def _run(folder: Path) -> int:
-    try:
-        job = JobFolder.open(folder)
-        options = WalkOptions()
-        os.nice(max(0, options.niceness - os.nice(0)))
-        with exclusive_access(job.path, ".worker.lock", waits=False), keeping_photos():
-            return 0 if worker_of(job, options).run() else 3
-    except ArviewError as error:
-        print(error, file=sys.stderr)
-        return 2
-    except Exception:
-        traceback.print_exc()
-        return 1
-
-
-def worker_of(job: JobFolder, options: WalkOptions) -> WalkWorker:
-    """The worker for a first measurement or a re-check."""
-    return WalkWorker(job, options)
 
 
 class _WalkEndedError(Exception):
