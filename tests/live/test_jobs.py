@@ -17,7 +17,7 @@ from arview.workflow.walk.job import JobFolder, find_job
 from arview.workflow.walk.records import WalkState
 from helpers.live_client import Http, Running, running, wait
 from helpers.live_jobs import about, job_options, measured, photo, piece, quiet_worker, rough, send
-from helpers.live_sample import frames, loader, options
+from helpers.live_sample import CLIP, frames, loader, options
 
 pytestmark = pytest.mark.slow  # each needs a server
 
@@ -331,3 +331,33 @@ def test_a_disk_that_is_full_is_said_and_nothing_is_confirmed(page: Http, server
     finally:
         space._options = chosen
     assert send(page, job, photo(1)) == "0001.jpg"
+
+
+def test_pages_of_a_station_camera_show_each_its_own_job(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(workers, "start_worker", quiet_worker)
+    chosen = options(source=str(CLIP), inspection=None, reload_interval_s=0.1, jobs=job_options(tmp_path))
+    with running(chosen, loader(chosen)) as server:
+        pages = [server.session(), server.session(), server.session()]
+        clients = [page.join() for page in pages]
+        jobs = [started(pages[0], "BP-1"), started(pages[0], "BP-2")]
+        for number, value_mm in enumerate((0.11, 2.22)):
+            measured(on_disk(tmp_path, jobs[number]), post_1=value_mm)
+            control(pages[number], clients[number], job=jobs[number])
+        shown = []
+        for page, client in zip(pages, clients, strict=True):
+            part = page.json("GET", f"/api/part?client={client}")[1]
+            shown.append(next(one["value_text"] for one in part["components"] if one["name"] == "post_1"))
+            pose = wait(lambda page=page, client=client: newest(page, client), 60)  # type: ignore[misc]
+            assert pose["revision"] == part["revision"]
+        assert "0.11" in shown[0] and "2.22" in shown[1] and shown[2] == ""
+        status, taken = pages[0].json("POST", f"/api/jobs/{jobs[0]}/take", {"client": clients[0]})
+        assert status == 201
+        (stored,) = on_disk(tmp_path, jobs[0]).photos()
+        assert stored.name == taken["photo"] and stored.source == "station"
+        assert pages[1].json("POST", f"/api/jobs/{jobs[0]}/take", {"client": clients[1]})[0] == 409
+
+
+def newest(page: Http, client: str) -> dict[str, Any] | None:
+    """*Pose* of the newest frame of a station camera, or None while there is none."""
+    status, headers, _ = page.ask("GET", f"/api/clients/{client}/frame")
+    return json.loads(headers["x-arview-answer"]) if status == 200 else None

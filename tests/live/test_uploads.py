@@ -338,13 +338,15 @@ def test_killed_before_every_single_step_of_a_decision(part: Part, tmp_path: Pat
 
 
 def test_announcements_that_a_crash_damaged_are_begun_again(part: Part, tmp_path: Path) -> None:
-    job, content = new_job(part, tmp_path), photo(9)
-    uploads = uploads_of(job, tmp_path)
-    begun = uploads.begin(about(content))
-    assert not isinstance(begun, str)
-    uploads.add(begun.name, 0, content[:1000])
-    path = job.path / "uploads" / f"{begun.name}.json"
-    for damage in (b"", b"{", b"[]", json.dumps({"bytes": "x"}).encode()):
-        path.write_bytes(damage)
-        assert refused(lambda: uploads.state(begun.name)).status == 404
-        assert sent(uploads_of(job, tmp_path), content) == "0001.jpg"
+    job = new_job(part, tmp_path)
+    damages = (b"", b"{", b"[]", json.dumps({"bytes": "x"}).encode())
+    for number, damage in enumerate(damages):
+        uploads, content = uploads_of(job, tmp_path), photo(number)
+        begun = uploads.begin(about(content))
+        assert not isinstance(begun, str)
+        uploads.add(begun.name, 0, content[:1000])
+        (job.path / "uploads" / f"{begun.name}.json").write_bytes(damage)
+        assert refused(lambda: uploads.state(begun.name)).status == 404  # noqa: B023 - called at once
+        name = sent(uploads_of(job, tmp_path), content)
+        assert (job.path / "photos" / name).read_bytes() == content
+    assert len(job.photos()) == len(damages)

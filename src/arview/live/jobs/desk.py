@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,9 @@ from arview.live.stream.subjects import Subjects
 from arview.pose import Identity, Pose
 from arview.workflow.walk.job import JobFolder
 
+WATCHED = ("state.json", "photos.jsonl", "inspection.json", "rough/inspection.json", "uploads")
+"""Files and folders of a job that are read again when they change."""
+
 
 class JobView:
     """What all clients that are bound to a job show: the parts, one of them with the numbers of the job.
@@ -35,12 +39,15 @@ class JobView:
     Attributes:
         subjects: the parts as bound clients see them.
         status: ``job`` of *Status*, of the last `refresh`.
+        clients: number of clients that are bound to it.
     """
 
     def __init__(self, subjects: Subjects, number: int, subject: JobSubject) -> None:
         self.number, self.subject = number, subject
         self.subjects = Subjects([subject if place == number else one for place, one in enumerate(subjects)])
         self.status: Document = {}
+        self.clients = 0
+        self._files: tuple[object, ...] = ()
         self._last: tuple[TrackedFrame, TrackedFrame] | None = None
 
     @property
@@ -50,8 +57,13 @@ class JobView:
 
     def refresh(self, board: JobBoard, workers: WorkerQueue) -> None:
         """Read what has changed of the job; not in the event loop."""
+        job, worker = self.job, workers.state(self.job.id)
+        files = worker, *(_changed_ns(job.path / name) for name in WATCHED)
+        if files == self._files:
+            return
+        self._files = files
         self.subject.reload()
-        job, state = self.job, self.subject.state
+        state = self.subject.state
         self.status = {
             "id": job.id,
             "serial": job.serial,
@@ -62,7 +74,7 @@ class JobView:
             "photos": len(job.photos()),
             "uploads": len(board.uploads(job).listed()),
             "revision": self.subjects.revision,
-            "worker": workers.state(job.id),
+            "worker": worker,
         }
 
     def shown(self, tracked: TrackedFrame) -> TrackedFrame:
@@ -82,6 +94,15 @@ class JobView:
             return pose
         reason = f"the code on this part says {pose.serial}, the inspection is of {self.job.serial}"
         return replace(pose, identity=Identity.OTHER, identity_reason=reason)
+
+
+def _changed_ns(path: Path) -> tuple[int, int] | None:
+    """Time of the last change and size of a file or folder; None where there is none."""
+    try:
+        stat = path.stat()
+    except OSError:
+        return None
+    return stat.st_mtime_ns, stat.st_size
 
 
 class Binding:
@@ -163,8 +184,20 @@ class JobDesk:
             )
         made = JobView(subjects, number, JobSubject(subjects[number], job, self.board))
         made.refresh(self.board, self.workers)
+        return made
+
+    def retain(self, view: JobView) -> None:
+        """A client is bound to a job: it is read again when it changes."""
         with self._lock:
-            return self._views.setdefault(job_id, made)
+            view.clients += 1
+            self._views[view.job.id] = view
+
+    def release(self, view: JobView) -> None:
+        """A client is no longer bound to a job."""
+        with self._lock:
+            view.clients -= 1
+            if view.clients <= 0:
+                self._views.pop(view.job.id, None)
 
     def part_of(self, job: JobFolder) -> int | None:
         """Number of the part that a job measures; None where it is not shown."""

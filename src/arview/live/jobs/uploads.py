@@ -124,9 +124,8 @@ class Uploads:
                 photo is not the one that was announced (then the upload is dropped).
         """
         with self._lock:
-            if (stored := self._stored(name)) is not None:
-                return stored
-            upload = self._known(name)
+            if (upload := self._read(name)) is None:
+                return self._stored(name) or self._known(name)
             if offset != upload.offset:
                 details = {"offset": upload.offset}
                 raise Refusal(409, "bad_offset", "the upload continues at another place", details=details)

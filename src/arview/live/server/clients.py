@@ -46,6 +46,7 @@ class Client:
         connection: the WebRTC connection, if that is the transport.
         inbox: newest frame of the feed, for the transport without WebRTC.
         binding: job that the page shows, if any.
+        serial: serial number of the job that it showed last.
         held: frame that is kept for a snapshot.
         is_busy: whether a request for a frame is being served.
         joined_s, seen_s: monotonic times of joining and of the last request.
@@ -66,6 +67,7 @@ class Client:
         self.connection: Connection | None = None
         self.inbox: AsyncNewestSlot[TrackedFrame] = AsyncNewestSlot(asyncio.get_running_loop())
         self.binding: Binding | None = None
+        self.serial: str | None = None
         self.held: TrackedFrame | None = None
         self.is_busy = False
         self.joined_s = self.seen_s = time.monotonic()

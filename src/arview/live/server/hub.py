@@ -250,13 +250,16 @@ class Hub:
     def _show(self, client: Client, view: JobView) -> None:
         """Let a client show a job: a phone's stream is then of that specimen, a station's only for this page."""
         client.binding = Binding(view)
+        self.desk.retain(view)
         if self._shared is None:
             client.feed.show(view.subjects)
-            client.feed.reset()
+            if client.serial not in (None, view.job.serial):
+                client.feed.reset()  # another specimen: what was seen of the one before is forgotten
             client.annotator.show(view.subjects)
         else:
             style, client.annotator = client.annotator.style, FrameAnnotator(view.subjects)
             client.annotator.style = style
+        client.serial = view.job.serial
 
     def _free(self, client: Client) -> None:
         """Let a client show what it showed before it was bound to a job."""
@@ -266,6 +269,7 @@ class Hub:
         if binding.guiding is not None:
             client.feed.unlisten(binding.guiding.listen)
             self.desk.unguide(binding.guiding, binding.view)
+        self.desk.release(binding.view)
         if self._shared is None:
             client.feed.show(self.subjects)
             client.annotator.show(self.subjects)
@@ -311,7 +315,7 @@ class Hub:
 
     async def close(self) -> None:
         """Remove all clients, close the station camera and finish the files."""
-        finish_workers = self.desk.close()
+        finishing = asyncio.ensure_future(in_daemon_thread(self.desk.close()))
         for task in (self._ticker, self._adopting, self._resuming):
             if task is not None:
                 task.cancel()
@@ -326,7 +330,7 @@ class Hub:
         if self._shared is not None:
             closing.append(in_daemon_thread(self._shared[0].close))
         await self._within(asyncio.gather(*closing, return_exceptions=True), self.options.closing_timeout_s)
-        await self._within(in_daemon_thread(finish_workers), 2.0 * self.options.closing_timeout_s)
+        await self._within(finishing, self.options.closing_timeout_s)
 
     async def _within(self, work: Awaitable[object], timeout_s: float) -> None:
         """Wait for work, but not for long."""
