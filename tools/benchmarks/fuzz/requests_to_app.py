@@ -14,7 +14,7 @@ from mutations import CHANGES, changed
 from seeds import make_seeds
 
 from arview.guideviews import GuideViewOptions
-from arview.live.options import LiveOptions, RequestLimits
+from arview.live.options import JobOptions, LiveOptions, RequestLimits
 from arview.live.security.access import Access
 from arview.live.server.app import make_app
 from arview.live.server.hub import Hub
@@ -48,6 +48,13 @@ PIECES = (
     "turns",
     "after",
     "token",
+    "jobs",
+    "JOB",
+    "uploads",
+    "photos",
+    "rework",
+    "devices",
+    "snapshots",
 )
 PATHS = (
     "/api/clients",
@@ -63,6 +70,29 @@ PATHS = (
     "/api/clients/NAME/status",
     "/static/main.js",
     "/api/model.glb",
+    "/api/part?client=NAME",
+    "/api/recordings",
+    "/api/devices",
+    "/api/devices/Device",
+    "/api/snapshots",
+    "/api/clients/NAME/snapshots?id=1",
+    "/api/jobs",
+    "/api/jobs/JOB",
+    "/api/jobs/JOB/capture",
+    "/api/jobs/JOB/uploads",
+    "/api/jobs/JOB/uploads/UPLOAD",
+    "/api/jobs/JOB/uploads/UPLOAD?offset=0",
+    "/api/jobs/JOB/take",
+    "/api/jobs/JOB/end",
+    "/api/jobs/JOB/reopen",
+    "/api/jobs/JOB/recheck",
+    "/api/jobs/JOB/decisions",
+    "/api/jobs/JOB/ticks",
+    "/api/jobs/JOB/sign",
+    "/api/jobs/JOB/photos/0001.jpg",
+    "/api/jobs/JOB/decisions.csv",
+    "/api/jobs/JOB/report.html",
+    "/api/jobs/JOB/rework/brick.svg",
 )
 BODIES = (
     b"",
@@ -73,6 +103,17 @@ BODIES = (
     b'{"transport": "webrtc", "mode": "video", "offer": {"type": "offer", "sdp": "'
     b"v=0\\r\\no=- 1 2 IN IP4 127.0.0.1\\r\\n"
     b's=-\\r\\nt=0 0\\r\\na=group:BUNDLE 0 1\\r\\nm=video 9 UDP/TLS/RTP/SAVPF 96\\r\\na=mid:0\\r\\n"}}',
+)
+JOB_BODIES = (
+    b'{"part": 0, "serial": "BP-1"}',
+    b'{"bytes": 1000, "sha256": "' + b"ab" * 32 + b'", "source": "still", "taken": "2026-11-27T08:00:00Z", "hint": '
+    b'{"cam_from_model": [1,0,0,0,0,1,0,0,0,0,1,300,0,0,0,1], "camera": {}, "quality": 0.5}, '
+    b'"media_type": "image/jpeg"}',
+    b'{"job": "JOB", "capture": "JOB"}',
+    b'{"client": "NAME"}',
+    b'{"components": ["brick"]}',
+    b'{"component": "brick", "is_ok": false, "reason": "bent", "note": "", "by": "Ada", "photo": null}',
+    b'{"component": "brick", "step": 0, "is_done": true, "by": "Ada"}',
 )
 HEADERS = (
     ("content-type", "application/json"),
@@ -144,7 +185,7 @@ def fuzz_requests(folder: Path) -> tuple[Callable[[Any], None], st.SearchStrateg
     home = folder / "http" / "seeds"
     seeds = make_seeds(home, "part", "picture")
     jpeg = next(path for path in seeds["picture"] if path.suffix == ".jpg").read_bytes()
-    bodies = (*BODIES, jpeg)
+    bodies = (*BODIES, *JOB_BODIES, jpeg)
     options = LiveOptions(
         requests=RequestLimits(
             per_s=1e9,
@@ -158,6 +199,7 @@ def fuzz_requests(folder: Path) -> tuple[Callable[[Any], None], st.SearchStrateg
         ),
         camera="fov:60",
         record_folder=folder / "http",
+        jobs=JobOptions(folder / "http" / "jobs", min_free_bytes=0, workers=0),
         clients=4,
     )
     views = GuideViewOptions(subdivisions=0, resolution_px=100, renderer="zbuffer")
@@ -172,6 +214,11 @@ def fuzz_requests(folder: Path) -> tuple[Callable[[Any], None], st.SearchStrateg
         return hub, make_app(hub, access)
 
     hub, app = loop.run_until_complete(start())
+    hub.desk.begin(subject)
+    job, _ = hub.desk.start(0, "BP-1", None)
+
+    def filled(text: str, name: str) -> str:
+        return text.replace("NAME", name).replace("JOB", job.id).replace("UPLOAD", "ab" * 16)
 
     async def client() -> str:
         if not hub.clients:
@@ -188,7 +235,8 @@ def fuzz_requests(folder: Path) -> tuple[Callable[[Any], None], st.SearchStrateg
             name = await client()
             names = {name for name, _ in more}
             headers = [*[pair for pair in usual if pair[0] not in names], *more]
-            return await ask(app, method, target.replace("NAME", name), headers, body)
+            content = body.replace(b"JOB", job.id.encode()).replace(b"NAME", name.encode())
+            return await ask(app, method, filled(target, name), headers, content)
 
         if "watch.mjpg" in target:
             return

@@ -230,9 +230,9 @@ class JobHandlers:
         """Keep a decision about a component."""
         job = await self._measured(request)
         one = {"component": "", "is_ok": None, "photo": None} | await self._json(request)
-        texts = [one.get(key) or "" for key in ("reason", "note", "by")]
+        reason, note, by = (one.get(key) or "" for key in ("reason", "note", "by"))
         return await self._kept(
-            job, lambda: decide_component(job.path, one["component"], one["is_ok"], *texts, photo=one["photo"])
+            job, lambda: decide_component(job.path, one["component"], one["is_ok"], reason, note, by, one["photo"])
         )
 
     async def tick(self, request: Request) -> Response:
