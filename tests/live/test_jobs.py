@@ -296,6 +296,9 @@ def test_a_recheck_shows_the_new_number_beside_the_others(page: Http, folder: Pa
     assert page.json("POST", f"/api/jobs/{first}/recheck", {"components": ["nope"]})[0] == 400
     assert page.json("POST", f"/api/jobs/{first}/recheck", {"components": [3]})[0] == 400
     status = control(page, client, job=again["id"])
+    assert [(one["name"], one["before_mm"], one["after_mm"]) for one in again["before_after"]] == [
+        ("post_1", 1.357, None)
+    ]
     shown = {one["name"]: one for one in page.json("GET", f"/api/part?client={client}")[1]["components"]}
     assert shown["post_1"]["value_text"] == "measuring" and shown["post_1"]["verdict"] is None
     assert shown["post_2"]["verdict"] == "pass"
@@ -308,6 +311,29 @@ def test_a_recheck_shows_the_new_number_beside_the_others(page: Http, folder: Pa
         {"name": "post_1", "before_mm": 1.357, "after_mm": 0.1, "verdict_before": "fail", "verdict_after": "pass"}
     ]
     assert page.json("GET", f"/api/jobs/{first}")[1]["rechecks"] == [again["id"]]
+    # The first measurement shows the newest value of each component, too.
+    control(page, client, job=first)
+    shown = {one["name"]: one for one in page.json("GET", f"/api/part?client={client}")[1]["components"]}
+    assert shown["post_1"]["verdict"] == "pass"
+    # One log for both; a photo of the re-check has its place in its name.
+    send(page, again["id"], photo(1))
+    decision = {"component": "post_1", "is_ok": True, "reason": "put right", "by": "Ada", "photo": "0001.jpg"}
+    status, kept = page.json("POST", f"/api/jobs/{again['id']}/decisions", decision)
+    assert status == 201 and kept["photo"] == "recheck/01/0001.jpg"
+    for job in (first, again["id"]):
+        assert [one["entry"] for one in page.json("GET", f"/api/jobs/{job}")[1]["decisions"]] == [1]
+        assert page.ask("GET", f"/api/jobs/{job}/photos/recheck/01/0001.jpg")[2] == photo(1)
+    assert page.ask("GET", f"/api/jobs/{first}/photos/recheck/01/0002.jpg")[0] == 404
+
+
+def test_nobody_signs_what_is_written_again(page: Http, server: Running, folder: Path) -> None:
+    job = started(page)
+    measured(on_disk(folder, job))
+    on_disk(folder, job).write_state(replace(on_disk(folder, job).state(), cloud="running"))
+    server.hub.desk.workers.ask(on_disk(folder, job))
+    assert page.json("POST", f"/api/jobs/{job}/sign", {"by": "Ada"})[0] == 409
+    on_disk(folder, job).write_state(replace(on_disk(folder, job).state(), cloud="failed"))
+    assert page.json("POST", f"/api/jobs/{job}/sign", {"by": "Ada"})[0] == 201
 
 
 def test_a_failed_measurement_is_told(page: Http, folder: Path) -> None:

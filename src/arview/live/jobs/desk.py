@@ -58,7 +58,8 @@ class JobView:
     def refresh(self, board: JobBoard, workers: WorkerQueue) -> None:
         """Read what has changed of the job; not in the event loop."""
         job, worker = self.job, workers.state(self.job.id)
-        files = worker, *(_changed_ns(job.path / name) for name in WATCHED)
+        paths = [*(job.path / name for name in WATCHED), *sorted((job.parent or job).path.glob("recheck/*/state.json"))]
+        files = worker, *map(_changed_ns, paths)
         if files == self._files:
             return
         self._files = files

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import asdict
 from typing import Any
 
 from arview.decisions import decision_document, log_of, state_document, state_of_record
 from arview.errors import ArviewError
-from arview.inspection import Inspection
+from arview.inspection import Inspection, Verdict
 from arview.inspection.summary import overall_verdict, verdict_sentence
 from arview.live.jobs.board import JobBoard
 from arview.live.jobs.desk import JobDesk
@@ -17,6 +18,7 @@ from arview.overlay.labels import detail_text, value_text
 from arview.overlay.options import OverlayOptions
 from arview.rework import instruction_document, instructions
 from arview.workflow.walk.job import JobFolder
+from arview.workflow.walk.merged import BeforeAfter, before_after, merged
 
 logger = logging.getLogger("arview.live")
 
@@ -59,7 +61,7 @@ def job_document(job: JobFolder, desk: JobDesk) -> Document:
         "rework": rework(job, desk),
         **_decisions(job, inspection),
         "rechecks": [one.id for one in job.rechecks()],
-        "before_after": _before_after(job, board),
+        "before_after": _before_after(job),
     }
 
 
@@ -114,23 +116,17 @@ def _decisions(job: JobFolder, inspection: Inspection | None) -> Document:
     }
 
 
-def _before_after(job: JobFolder, board: JobBoard) -> list[Document]:
-    """Components of a re-check in the first measurement and now; empty for a first measurement."""
-    checked, first = job.components, job.parent
-    if checked is None or first is None:
+def _before_after(job: JobFolder) -> list[Document]:
+    """Components of a re-check before it and now; empty for a first measurement."""
+    if job.components is None:
         return []
-    before, after = board.inspection(first), board.inspection(job)
-    rows = []
-    for name in checked:
-        old = None if before is None else before.find(name)
-        new = None if after is None else after.find(name)
-        rows.append(
-            {
-                "name": name,
-                "before_mm": None if old is None else old.distance_mm,
-                "after_mm": None if new is None else new.distance_mm,
-                "verdict_before": None if old is None else str(old.verdict),
-                "verdict_after": None if new is None else str(new.verdict),
-            }
-        )
-    return rows
+    try:
+        rows = [asdict(one) for one in before_after(job)]
+        known = merged(job) if not rows else None
+    except ArviewError as error:
+        logger.warning("%s: %s", job.id, error)
+        return []
+    if known is None:
+        return rows
+    before = [one for name in job.components if (one := known.inspection.find(name)) is not None]
+    return [asdict(BeforeAfter(one.name, one.distance_mm, None, one.verdict, Verdict.NOT_MEASURED)) for one in before]

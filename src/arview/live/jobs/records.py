@@ -8,7 +8,7 @@ import threading
 
 from arview.errors import ArviewError
 from arview.history import HistoryStore
-from arview.report.decisions import update_report
+from arview.report.decisions import update_reports
 from arview.workflow.walk.job import JobFolder
 
 logger = logging.getLogger("arview.live")
@@ -22,11 +22,10 @@ def tell_report_and_history(job: JobFolder) -> None:
 
     The log of decisions holds them already: what goes wrong here is told, and mended by the next decision.
     """
-    report, inspection = job.path / "report.html", job.path / "inspection.json"
+    inspection = (job.parent or job).path / "inspection.json"
     with _WRITING:
         try:
-            if report.is_file():
-                update_report(report, inspection)
+            update_reports(job.path)
             if store := os.environ.get("ARVIEW_STORE"):
                 with HistoryStore(store) as opened:
                     opened.add(inspection)

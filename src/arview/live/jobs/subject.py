@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import itertools
+import logging
 from dataclasses import replace
 
+from arview.errors import ArviewError
 from arview.inspection import ComponentDeviation, Finding, Inspection
 from arview.live.jobs.board import JobBoard
 from arview.live.stream.inspection_file import age_notices
 from arview.live.stream.notices import Notice
 from arview.live.stream.subject import Subject
 from arview.workflow.walk.job import JobFolder
+from arview.workflow.walk.merged import merged
 from arview.workflow.walk.records import WalkState
+
+logger = logging.getLogger("arview.live")
 
 MEASURING = "measuring"
 """What stands in place of a value that is not there yet."""
@@ -22,8 +27,8 @@ _REVISIONS = itertools.count(1 << 20)
 class JobSubject(Subject):
     """A part with the inspection of a job; safe to use from several threads.
 
-    While the job is measured, a component without a number has none of an earlier measurement either. In a re-check the
-    components that are not checked again keep the numbers of the first measurement.
+    While the job is measured, a component without a number has none of an earlier measurement either. The components
+    that a re-check leaves out keep their newest numbers.
 
     Args:
         base: the part as the server shows it without a job.
@@ -76,19 +81,26 @@ class JobSubject(Subject):
         return notices
 
     def _merged(self, state: WalkState) -> Inspection | None:
-        """What is shown: of an unfinished job only components with a number; in a re-check the others as before."""
+        """What is shown: of an unfinished job only components with a number, else the newest value of each."""
         model = self.part.model
         own = self._board.inspection(self.job, model)
         if own is not None and is_open(state):
             own = replace(own, components=tuple(one for one in own.components if _has_number(one)))
-        checked, first = self.job.components, self.job.parent
-        if checked is None or first is None:
+        first = self.job.parent
+        if first is None and is_open(state):
             return own
-        before = self._board.inspection(first, model)
-        kept = () if before is None else tuple(one for one in before.components if one.name not in checked)
+        try:
+            newest = merged(self.job, model)
+        except ArviewError as error:
+            logger.warning("%s: %s", self.job.id, error)
+            return own
+        if newest is None or not is_open(state):
+            return own if newest is None else newest.inspection
+        # A re-check that is measured: what is checked again has no number of before.
+        checked = self.job.components or ()
         latest = () if own is None else tuple(one for one in own.components if one.name in checked)
-        document = own or before
-        return None if document is None else replace(document, components=(*latest, *kept))
+        kept = tuple(one for one in newest.inspection.components if one.name not in checked)
+        return replace(newest.inspection, components=(*latest, *kept))
 
 
 def is_open(state: WalkState) -> bool:

@@ -22,6 +22,7 @@ from arview.decisions import (
     sign_inspection,
     tick_step,
 )
+from arview.decisions.folder import photo_path
 from arview.errors import InputError, OutputError
 from arview.live.jobs.desk import JobDesk
 from arview.live.jobs.documents import job_document, job_row, rework
@@ -85,7 +86,7 @@ class JobHandlers:
             Route(f"{job}/report.html", self.report),
             Route(f"{job}/inspection.json", self.inspection),
             Route(f"{job}/decisions.csv", self.decisions),
-            Route(f"{job}/photos/{{name}}", self.photo),
+            Route(f"{job}/photos/{{name:path}}", self.photo),
             Route(f"{job}/rework/{{component}}.svg", self.drawing),
             Route(f"{job}/rework/{{picture:path}}", self.picture),
         ]
@@ -217,10 +218,9 @@ class JobHandlers:
     async def photo(self, request: Request) -> Response:
         """A photo as it was received."""
         job, name = await self._job(request), request.path_params["name"]
-        known = await asyncio.to_thread(lambda: {photo.name for photo in job.photos()})
-        if name not in known:
+        path = await asyncio.to_thread(_photo_file, job, name)
+        if path is None:
             raise Refusal(404, "not_found", "there is no such photo")
-        path = job.path / "photos" / name
         headers = {"Cache-Control": "private, max-age=86400"}
         return FileResponse(path, media_type=_PHOTO_TYPES.get(path.suffix, "application/octet-stream"), headers=headers)
 
@@ -246,6 +246,8 @@ class JobHandlers:
     async def sign(self, request: Request) -> Response:
         """Keep a signature."""
         job = await self._measured(request)
+        if await asyncio.to_thread(self._is_unfinished, job):
+            raise Refusal(409, "not_done", "the cloud and the report are being made; sign when they are done")
         one = await self._json(request)
         return await self._kept(job, lambda: sign_inspection(job.path, one.get("by") or "", one.get("note") or ""))
 
@@ -321,6 +323,11 @@ class JobHandlers:
             raise Refusal(409, "not_done", "this part is not measured yet")
         return job
 
+    def _is_unfinished(self, job: JobFolder) -> bool:
+        """Whether the inspection will be written again, which would make a signature void."""
+        is_worked_on = self._desk.workers.state(job.id) in ("waiting", "running")
+        return is_worked_on and job.state().cloud in ("waiting", "running")
+
     async def _document(self, job: JobFolder, status: int = 200) -> Response:
         return JSONResponse(await self._stored(lambda: job_document(job, self._desk)), status)
 
@@ -345,6 +352,20 @@ class JobHandlers:
         return await json_body(
             request, self._desk.board.options.text_bytes, self._hub.options.requests.body_timeout_s
         )  # fmt: skip
+
+
+def _photo_file(job: JobFolder, name: str) -> Path | None:
+    """File of a photo of a job, or of the photo of another of its record that a decision names; None without one."""
+    if name in {photo.name for photo in job.photos()}:
+        return job.path / "photos" / name
+    path = photo_path(job.path, name) if "/" in name else None
+    if path is None:
+        return None
+    try:
+        owner = JobFolder.open(path.parent.parent)
+    except InputError:
+        return None
+    return path if path.name in {photo.name for photo in owner.photos()} else None
 
 
 def _absolute(camera: str | None) -> str | None:
