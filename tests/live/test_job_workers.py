@@ -39,7 +39,8 @@ class Workers:
         self.started: list[str] = []
         self.processes: dict[str, subprocess.Popen[bytes]] = {}
         self.code = code
-        self.queue = WorkerQueue(options, self.start)
+        self.done: list[str] = []
+        self.queue = WorkerQueue(options, self.start, lambda job: self.done.append(job.id))
 
     def start(self, job: JobFolder) -> subprocess.Popen[bytes]:
         self.started.append(job.id)
@@ -100,6 +101,7 @@ def test_one_runs_at_a_time_and_the_next_follows(part: Part, tmp_path: Path, mad
     workers.processes[two.id].kill()
     workers.tick_until(lambda: workers.started == [two.id, one.id])
     assert workers.queue.state(two.id) == "none"
+    wait(lambda: workers.done == [two.id])
 
 
 def test_a_worker_that_only_waits_makes_room_and_is_started_again(part: Part, tmp_path: Path, made: Any) -> None:

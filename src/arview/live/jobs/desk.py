@@ -13,6 +13,7 @@ import numpy as np
 from arview.cad.part import Part
 from arview.live.jobs.board import JobBoard
 from arview.live.jobs.guiding import Guiding
+from arview.live.jobs.records import tell_report_and_history
 from arview.live.jobs.subject import JobSubject
 from arview.live.jobs.workers import Start, WorkerQueue
 from arview.live.options import JobOptions
@@ -97,6 +98,12 @@ class JobView:
         return replace(pose, identity=Identity.OTHER, identity_reason=reason)
 
 
+def _tell_others(job: JobFolder) -> None:
+    """A re-check that is measured is shown in the report of the first measurement."""
+    if job.components is not None:
+        tell_report_and_history(job)
+
+
 def _changed_ns(path: Path) -> tuple[int, int] | None:
     """Time of the last change and size of a file or folder; None where there is none."""
     try:
@@ -132,7 +139,7 @@ class JobDesk:
 
     def __init__(self, options: JobOptions, start: Start | None = None) -> None:
         self.board = JobBoard(options)
-        self.workers = WorkerQueue(options, start)
+        self.workers = WorkerQueue(options, start, _tell_others)
         self._lock = threading.Lock()
         self._subjects: Subjects | None = None
         self._parts: dict[str, int] = {}

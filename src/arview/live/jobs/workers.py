@@ -65,10 +65,13 @@ class WorkerQueue:
     Args:
         options: bounds.
         start: starts the worker of a job; default: `start_worker`.
+        on_done: called with a job that is measured, in a thread of its own.
     """
 
-    def __init__(self, options: JobOptions, start: Start | None = None) -> None:
-        self._options, self._start = options, start or start_worker
+    def __init__(
+        self, options: JobOptions, start: Start | None = None, on_done: Callable[[JobFolder], None] | None = None
+    ) -> None:
+        self._options, self._start, self._on_done = options, start or start_worker, on_done
         self._lock = threading.RLock()
         self._entries: dict[str, _Entry] = {}
         self._is_closed = False
@@ -182,6 +185,8 @@ class WorkerQueue:
             entry.stopping = False
         elif is_finished and knows_all:
             del self._entries[entry.job.id]
+            if self._on_done is not None and state.stage == "done":
+                threading.Thread(target=self._on_done, args=(entry.job,), name="arview-done", daemon=True).start()
         elif is_finished or (code == 0 and not knows_all):
             pass  # a photo came while it was ending: it is started once more
         else:
