@@ -1,24 +1,68 @@
-"""A station that plays the sample's clip, and says of the part what a test wants (see `told_session`)."""
+"""A station that plays the sample's clip and knows the true pose of each frame: for tests without a tracker.
+
+What it says of the part beside the pose is in `told_session.TOLD`.
+"""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 from unittest import mock
 
-from arview.camera import Camera
-from arview.live.stream.subject import Subject
-from arview.video import VideoSink
+import cv2
+import numpy as np
+
+from arview.live.stream.subjects import Subjects
+from arview.pose import ComponentPresence, Pose, Presence, TrackingState, Visibility
+from arview.video import Image, VideoSink
 from helpers import live_browser
 from helpers.live_client import Running, running
 from helpers.live_sample import INSPECTION, loader, options
-from helpers.told_session import Told
+from helpers.told_session import TOLD
 
 FPS = 5
+SMALL = 64, 36
+"""Size at which frames are compared, px."""
+PRESENT = ComponentPresence(Presence.PRESENT, Visibility.VISIBLE, 0.99, 9, 40.0)
+
+
+class TrueSession:
+    """Recognises the frames of the clip."""
+
+    camera = estimate = None
+
+    def __init__(self, images: Sequence[Image], names: Sequence[str]) -> None:
+        self._small = np.stack([_small(image) for image in images])
+        self._names = names
+
+    def process(self, image: Image, index: int, time_s: float) -> tuple[Pose, ...]:
+        number = int(np.argmin(np.abs(self._small - _small(image)).mean(axis=(1, 2, 3))))
+        truth = live_browser.truth()[number]
+        pose = Pose(truth, np.eye(6), 0.9, TrackingState.TRACKED, time_s, index, 1.0)
+        told = replace(pose, **TOLD["more"])
+        components = {**dict.fromkeys(self._names, PRESENT), **TOLD["components"]}
+        return (replace(told, components=components if told.cam_from_model is not None else {}),)
+
+    def expect(self, serials: Any) -> None:
+        pass
+
+    def reset(self, part: int | None) -> None:
+        pass
+
+    def confirm(self, part: int | None) -> None:
+        pass
+
+    def finish(self) -> None:
+        pass
+
+
+def _small(image: Image) -> Any:
+    return cv2.resize(image, SMALL, interpolation=cv2.INTER_AREA).astype(np.float32)
 
 
 @contextmanager
@@ -42,11 +86,10 @@ def told_station(folder: Path, width: int, height: int, has_numbers: bool = True
     record["created"] = (datetime.now(UTC) - timedelta(minutes=30)).strftime("%Y-%m-%dT%H:%M:%SZ")
     inspection = folder / "inspection.json"
     inspection.write_text(json.dumps(record))
-    start = Subject.session
 
-    def session(subject: Subject, camera: Camera) -> Any:
-        return Told(start(subject, camera), [one.name for one in subject.part.model.components])
+    def session(subjects: Subjects, camera: object) -> TrueSession:
+        return TrueSession(images, [one.name for one in subjects[0].part.model.components])
 
     chosen = options(**{"source": str(path), "inspection": inspection, "record_folder": folder, **more})
-    with mock.patch.object(Subject, "session", session), running(chosen, loader(chosen)) as server:
+    with mock.patch.object(Subjects, "session", session), running(chosen, loader(chosen)) as server:
         yield server

@@ -10,6 +10,7 @@ const SIGNS = { pass: "pass", fail: "fail", undecided: "undecided" };
 
 export class Files {
   #isBusy = false;
+  #isAskedAgain = false;
 
   /**
    * @param box element of the section.
@@ -21,6 +22,7 @@ export class Files {
 
   /** Ask for the lists anew and show them. */
   async refresh() {
+    this.#isAskedAgain = this.#isBusy;
     if (this.#isBusy) return;
     this.#isBusy = true;
     try {
@@ -39,6 +41,7 @@ export class Files {
     } finally {
       this.#isBusy = false;
     }
+    if (this.#isAskedAgain) await this.refresh(); // something was added meanwhile
   }
 
   /** Title and rows of a list; an Error instead of a list is told. */
