@@ -81,8 +81,9 @@ class RecheckWorker(WalkWorker):
         poses = {name: self._from_scan(pose) for name, pose in poses_of(self.job.photos()).items()}
         self.earlier.match(photos, features, poses)
 
-    def _measure_roughly(self, prepared: Prepared, count: int) -> None:
+    def _measure_roughly(self, prepared: Prepared, count: int) -> bool:
         """A re-check has so few photos that it is measured once."""
+        return True
 
     def _finish(self, prepared: Prepared) -> None:
         """The measurement of the components in the new photos."""

@@ -36,7 +36,8 @@ _POLL_S = 0.1
 class WalkOptions:
     """Options of a measurement while photos arrive."""
 
-    first_rough: int = 6  # photos of the first provisional measurement
+    first_rough: int = 5  # photos of the first provisional measurement
+    rough_retry: int = 2  # photos more after which it is tried again when it failed
     rough_growth: float = 2.0  # photos of the next provisional measurement, as a multiple of those of the last one
     niceness: int = 5  # of the process while the user waits …
     background_niceness: int = 15  # … and while the cloud and the report follow
@@ -77,9 +78,10 @@ class WalkWorker:
     def _restart_state(self) -> None:
         """Take up the state of an earlier worker, or begin a new one."""
         if not (self.state.stage == "done" and self.job.is_ended):
-            rough = self.job.path / "rough" / "inspection.json"
-            kept = str(rough.relative_to(self.job.path)) if rough.is_file() else None
-            self.state = WalkState(photos=len(self.job.photos()), is_rough=kept is not None, inspection=kept)
+            path = self.job.inspection_path
+            kept = None if path is None else path.relative_to(self.job.path).as_posix()
+            is_rough = kept is not None and kept != "inspection.json"
+            self.state = WalkState(photos=len(self.job.photos()), is_rough=is_rough, inspection=kept)
             self._say(text="waiting for photos")
 
     def _wait_for_first_photo(self) -> Prepared:
@@ -101,8 +103,10 @@ class WalkWorker:
                 if photos != self.state.photos:
                     self._say(photos=photos, text=f"{photos} photos")
                 if preparation.ready >= wanted:
-                    wanted = round(self.options.rough_growth * preparation.ready)
-                    self._measure_roughly(prepared, preparation.ready)
+                    count = preparation.ready
+                    is_measured = self._measure_roughly(prepared, count)
+                    more = round(self.options.rough_growth * count)
+                    wanted = more if is_measured else count + self.options.rough_retry
                 time.sleep(_POLL_S)
         finally:
             preparation.end()
@@ -110,8 +114,8 @@ class WalkWorker:
     def _prepare_more(self, photos: Sequence[Photo]) -> None:
         """What else is found as soon as photos arrive."""
 
-    def _measure_roughly(self, prepared: Prepared, count: int) -> None:
-        """A provisional measurement of the first photos; given up when the walk ends, silent when it fails."""
+    def _measure_roughly(self, prepared: Prepared, count: int) -> bool:
+        """A provisional measurement of the first photos, given up when the walk ends; whether it could be made."""
         folder, photos = self.job.path / "rough", self.job.photos()[:count]
         options = replace(prepared.reconstruct, last_stage="scale", known=KnownPairs(poses=poses_of(photos)))
 
@@ -127,7 +131,7 @@ class WalkWorker:
             )  # fmt: skip
             inspection = measured_in_photos(folder, prepared, tell)
         except (_WalkEndedError, ArviewError):
-            return
+            return False
         note = f"provisional: from the first {count} photos, while more are taken"
         inspection = replace(inspection, provenance=replace(inspection.provenance, note=note))
         save_inspection(inspection, folder / "inspection.json")
@@ -136,6 +140,7 @@ class WalkWorker:
             placed=placed, is_rough=True, inspection="rough/inspection.json",
             text=f"{len(self.job.photos())} photos; provisional numbers from {count}",
         )  # fmt: skip
+        return True
 
     # --- after the end -----------------------------------------------------------------------------------
 
