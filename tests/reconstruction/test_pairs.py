@@ -28,7 +28,7 @@ from arview.reconstruction.types import Photo
 from helpers.photo_scene import CAMERA, ring
 
 COUNT = 14
-OPTIONS = PairOptions(preview_features=40)
+OPTIONS = PairOptions(preview_features=40, hints_from=COUNT)
 
 
 def photo(name: str, path: Path = Path("none")) -> Photo:
@@ -56,8 +56,10 @@ def test_rough_poses_choose_the_pairs() -> None:
     with ThreadPoolExecutor(2) as pool:
         by_pose = chosen_pairs(PHOTOS, unlike(), OPTIONS, known, pool)
         by_look = chosen_pairs(PHOTOS, unlike(), OPTIONS, KnownPairs(), pool)
+        few = chosen_pairs(PHOTOS, unlike(), replace(OPTIONS, hints_from=COUNT + 1), known, pool)
     apart = {min(j - i, COUNT - j + i) for i, j in by_pose}
     assert apart == {1, 2} and len(by_pose) == 2 * COUNT  # 26° from photo to photo, less between their axes
+    assert few == by_look
     assert {j - i for i, j in by_look} == {1, 2, 3}  # nothing in common, so that only what follows is matched
 
 

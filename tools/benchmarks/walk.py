@@ -29,6 +29,7 @@ from arview.workflow.job import InspectJob
 from arview.workflow.prepare import prepare
 from arview.workflow.run import measured_in_photos
 from arview.workflow.walk.job import JobFolder, start_worker
+from arview.workflow.walk.merged import before_after
 
 
 def main() -> None:
@@ -40,6 +41,9 @@ def main() -> None:
     parser.add_argument("--hints", type=Path, metavar="JSON", help="name of photo → cam_from_model (16 numbers)")
     parser.add_argument("--folder", type=Path, default=Path("/tmp/arview-walk"), help="of the job; emptied first")
     parser.add_argument("--compare", action="store_true", help="also measure the photos as arview inspect does")
+    parser.add_argument("--recheck", metavar="NAMES", help="components to check again, with commas")
+    parser.add_argument("--recheck-photos", type=Path, metavar="FOLDER",
+                        help="photos of the re-check; default: every fourth of the photos")  # fmt: skip
     parser.add_argument("--no-cloud", action="store_true", help="end the worker when the verdicts are there")
     arguments = parser.parse_args()
     shutil.rmtree(arguments.folder, ignore_errors=True)
@@ -48,7 +52,34 @@ def main() -> None:
     report = walk(job, arguments)
     if arguments.compare:
         report |= compared(job, arguments)
+    if arguments.recheck:
+        report["recheck"] = checked_again(job, arguments)
     print(json.dumps(report, indent=1))
+
+
+def checked_again(job: JobFolder, arguments: argparse.Namespace) -> dict[str, Any]:
+    """Seconds from the last photo of a re-check to its verdict, and the values before and after."""
+    recheck = job.recheck(arguments.recheck.split(","))
+    paths, _ = photo_paths(arguments.recheck_photos or arguments.photos)
+    chosen = paths if arguments.recheck_photos else paths[1::4]
+    with start_worker(recheck) as worker:
+        while recheck.state().text != "waiting for photos" and worker.poll() is None:
+            time.sleep(0.1)
+        for path in chosen:
+            content = path.read_bytes()
+            recheck.add_photo(content, hashlib.sha256(content).hexdigest(), "upload")
+            time.sleep(arguments.pace)
+        before_s, began = cpu_of(worker.pid), time.monotonic()
+        recheck.end()
+        while recheck.state().stage in ("collecting", "measuring") and worker.poll() is None:
+            time.sleep(0.05)
+        seconds, cpu_s = time.monotonic() - began, cpu_of(worker.pid) - before_s
+    state = recheck.state()
+    return {
+        "photos": len(chosen), "last_photo_to_verdict_s": round(seconds, 2), "of_it_cpu_s": round(cpu_s, 2),
+        "stage": state.stage, "text": state.text,
+        "before_after_mm": {one.name: (one.before_mm, one.after_mm) for one in before_after(recheck)},
+    }  # fmt: skip
 
 
 def walk(job: JobFolder, arguments: argparse.Namespace) -> dict[str, Any]:
@@ -100,8 +131,8 @@ def compared(job: JobFolder, arguments: argparse.Namespace) -> dict[str, Any]:
             InspectJob(str(arguments.part), str(job.path / "photos"), serial=job.serial, pairs=pairs), folder
         )
         options = replace(prepared.reconstruct, last_stage="scale")
-        reconstruct(job.path / "photos", folder, prepared.part, None, options)
-        other = measured_in_photos(folder, prepared, lambda what, done, total: None)
+        again = reconstruct(job.path / "photos", folder, prepared.part, None, options)
+        other = measured_in_photos(again, prepared, lambda what, done, total: None)
         found[name] = difference(ours, other)
     return found
 

@@ -33,6 +33,7 @@ class PairOptions:
     preview_matches: int = 5  # of these that a chosen pair needs; chance gives 0 to 3
     all_pairs_up_to: int = 12  # photos; up to this number every pair is matched
     neighbours: int = 3  # following photos that are always matched: a walk around the part, a video
+    hints_from: int = 30  # photos from which rough poses choose the pairs; fewer are matched as without them
     max_hint_angle_deg: float = 60.0  # between the directions of two rough poses; SIFT finds nothing beyond 45°
     min_partners: int = 2  # of a photo with a rough pose; with fewer, its pose is not trusted
 
@@ -64,7 +65,8 @@ def chosen_pairs(
         given = ((place.get(one), place.get(other)) for one, other in known.recorded)
         return sorted({(min(i, j), max(i, j)) for i, j in given if i is not None and j is not None and i != j})
     pairs = list(itertools.combinations(range(len(photos)), 2))
-    axes = [None if (pose := known.poses.get(photo.name)) is None else pose[2, :3] for photo in photos]
+    poses = _trusted_poses(photos, options, known)
+    axes = [None if (pose := poses.get(photo.name)) is None else pose[2, :3] for photo in photos]
     if len(photos) <= options.all_pairs_up_to and all(axis is None for axis in axes):
         return pairs
     limit = np.cos(np.deg2rad(options.max_hint_angle_deg))
@@ -78,17 +80,26 @@ def chosen_pairs(
     return [pair for pair in pairs if by_pose(pair) or pair in promising]
 
 
+def _trusted_poses(photos: Sequence[Photo], options: PairOptions, known: KnownPairs) -> Mapping[str, Array]:
+    """The rough poses, where there are so many photos that to choose by them saves time.
+
+    With few photos the pairs, and so the numbers, are those that the photos alone give.
+    """
+    return known.poses if len(photos) >= options.hints_from else {}
+
+
 def doubtful_pairs(
     photos: Sequence[Photo], features: Sequence[Features], options: PairOptions, known: KnownPairs,
     tried: Sequence[Pair], matched: Sequence[Pair], pool: ThreadPoolExecutor,
 ) -> list[Pair]:  # fmt: skip
     """More pairs of photos whose rough pose led to too few partners, so that it is likely to be wrong."""
-    if known.recorded is not None:
+    poses = _trusted_poses(photos, options, known)
+    if known.recorded is not None or not poses:
         return []
     partners = np.zeros(len(photos), dtype=int)
     for pair in matched:
         partners[list(pair)] += 1
-    lonely = {i for i, photo in enumerate(photos) if photo.name in known.poses and partners[i] < options.min_partners}
+    lonely = {i for i, photo in enumerate(photos) if photo.name in poses and partners[i] < options.min_partners}
     rest = sorted(set(itertools.combinations(range(len(photos)), 2)) - set(tried))
     return promising_pairs(features, options, [pair for pair in rest if lonely & set(pair)], pool)
 

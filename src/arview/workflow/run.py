@@ -189,14 +189,14 @@ class _InspectionRun:
         options = replace(prepared.reconstruct, starts_over=starts_over, last_stage="scale")
         if self.stages.key("measure") is None or starts_over:
             with _measuring():
-                reconstruct(
+                found = reconstruct(
                     job.photo_source, self.folder, prepared.part, job.camera, options, progress=self.progress,
                     memory=self.memory,
                 )  # fmt: skip
             self.stages = Stages(self.folder)
             key = key_of(inputs, self.stages.key("scale"))
             if not self.stages.is_finished("verdict", key) or not path.is_file():
-                save_inspection(measured_in_photos(self.folder, prepared, self.progress), path)
+                save_inspection(measured_in_photos(found, prepared, self.progress), path)
                 self.stages.finish("verdict", key)
         return load_inspection(path, prepared.part.model)
 
@@ -283,19 +283,23 @@ class _InspectionRun:
         self.records.append(StageRecord(title, "done", time.perf_counter() - began, note))
 
 
-def measured_in_photos(folder: Path, prepared: Prepared, progress: Progress) -> Inspection:
-    """The measurement of a folder's reconstruction by sweep and edges, without a cloud.
+def measured_in_photos(found: Reconstruction, prepared: Prepared, progress: Progress) -> Inspection:
+    """The measurement of a reconstruction by sweep and edges, without a cloud.
 
     Raises:
         CannotMeasureError: the reconstruction has no frame, contradicts the CAD, or does not show the datums.
     """
-    from arview.measurement.folder import read_folder
+    from arview.measurement.folder import MetricReconstruction, read_folder
     from arview.measurement.run import measure
 
     methods = tuple(one for one in prepared.measure.methods if one != "cloud")
     options = replace(prepared.measure, methods=methods, maps_folder=None)
     with _measuring():
-        return measure(read_folder(folder, with_cloud=False), prepared.part, options, progress=progress)
+        if found.sparse is None or found.scale is None or found.scale.model_from_scan is None:
+            metric = read_folder(found.folder, with_cloud=False)  # which says what is missing
+        else:
+            metric = MetricReconstruction(found.sparse, found.scale, None)
+        return measure(metric, prepared.part, options, progress=progress)
 
 
 @contextmanager

@@ -129,7 +129,7 @@ class WalkWorker:
                 photo_files(self.job, photos), folder, prepared.part, prepared.job.camera, options, progress=tell,
                 memory=self.memory,
             )  # fmt: skip
-            inspection = measured_in_photos(folder, prepared, tell)
+            inspection = measured_in_photos(found, prepared, tell)
         except (_WalkEndedError, ArviewError):
             return False
         note = f"provisional: from the first {count} photos, while more are taken"
