@@ -45,6 +45,7 @@ from recordings import (
     table,
 )
 from rows import ResultRow
+from suites.capture import capture_rows, capture_sets
 from suites.coverage import coverage_rows
 from suites.detection import DetectionSuite
 from suites.guided_init import guided_init_rows
@@ -66,6 +67,7 @@ SECTIONS = (
     "track", "converge", "guided-init", "detect", "semisynthetic-track", "semisynthetic-detect", "false-alarms",
     "lookalike", "relocalize", "sample", "reconstruct", "measure", "real-track", "real-detect", "quality",
     "accepted", "scale", "presence", "several", "occluders", "coverage",
+    "capture",
 )  # fmt: skip
 
 
@@ -134,6 +136,7 @@ def main() -> None:
         lambda: SeveralSuite(found, details, chosen.frames).rows(),
         OccluderSuite(found, details).rows,
         lambda: coverage_rows(chosen.sets, chosen.use, chosen.folder / "coverage", details) if chosen.sets else [],
+        lambda: capture_rows(capture_sets(chosen.photo_set), chosen.folder / "capture", details),
     )
     sections = dict(zip(SECTIONS, makers, strict=True))
     rows: list[ResultRow] = []

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from arview.cad.part import Part
 from arview.cad.view_range import ViewRange
 from arview.camera import Camera
-from arview.capture.information import focal_px, view_information
+from arview.capture.information import Views, focal_px
 from arview.capture.options import CaptureOptions
 from arview.core.checks import check_type
 from arview.geometry import Array, look_at
@@ -35,16 +35,14 @@ class CaptureDome:
         directions: (N,3) unit vectors of the model from the part's centre.
         cell_deg: distance of neighbouring cells.
         distance_mm: nearest and farthest distance of a photo.
-        is_seen: (N,C) which components a photo from the middle of the cell shows, by a rendering.
-        information: (N,C,3,3) of such a photo, see `view_information`.
+        views: what a photo from the middle of each cell shows, by a rendering, and tells.
     """
 
     angles_deg: Array
     directions: Array
     cell_deg: float
     distance_mm: tuple[float, float]
-    is_seen: NDArray[np.bool_]
-    information: Array
+    views: Views
 
     @classmethod
     def of(cls, part: Part, camera: Camera, options: CaptureOptions | None = None) -> CaptureDome:
@@ -70,15 +68,14 @@ class CaptureDome:
         seen = np.array(
             [components_seen(model, camera, look_at(eye, model.center_in_model, up), options.coverage) for eye in eyes]
         )
-        points = component_points(part)
         focal = focal_px(camera) * options.photo_px_per_px
-        information = np.array(
-            [
-                view_information(points, row, eye, focal, options.information)
-                for row, eye in zip(seen, eyes, strict=True)
-            ]
-        )
-        return cls(angles, directions, cell_deg, distance_mm, seen, information)
+        views = Views.of(component_points(part), seen, eyes, focal, options.information)
+        return cls(angles, directions, cell_deg, distance_mm, views)
+
+    @property
+    def is_seen(self) -> NDArray[np.bool_]:
+        """(N,C) which components a photo from each cell shows."""
+        return self.views.is_seen
 
     def nearest(self, direction: Array) -> int:
         """Index of the cell nearest to a direction (3,)."""

@@ -3,7 +3,10 @@
 A photo measures the direction to a component with an error of a share of a pixel. Its information on the component's
 place is the projector across the ray, divided by the squared error at the component's distance. The information of
 independent photos adds up (the normal equations of a triangulated point), and its inverse is the covariance of the
-place. Views are chosen one after another, each so that the sum over the components of the place's expected error,
+place. A photo counts in full only where two others show the component from nearby: patches are compared in at least
+three photos, and look different from far apart.
+
+Views are chosen one after another, each so that the sum over the components of the expected error of the place,
 relative to the tolerance, falls most. That is A-optimality of the experiment's design (Pukelsheim 2006), used for the
 next best view by Wenhardt et al. (2007); the greedy choice is that of Roberts et al. (2017). The U that is stated is
 along the worst axis.
@@ -20,6 +23,9 @@ from numpy.typing import NDArray
 from arview.camera import Camera
 from arview.geometry import Array
 
+_NO_COSINE = -2.0
+"""Stands for the cosine to a photo that is not there."""
+
 
 @dataclass(frozen=True)
 class InformationOptions:
@@ -29,26 +35,120 @@ class InformationOptions:
     common_mm: float = 0.006  # standard deviation that more photos do not lower: form, lens, datums
     prior_mm: float = 5.0  # standard deviation of a place before any photo
     coverage_factor: float = 2.0  # k of the expanded uncertainty
+    matched_deg: float = 30.0  # angle to the second nearest photo up to which a photo counts in full …
+    match_fall_deg: float = 25.0  # … and by how much more its weight falls to a third
+    alone_weight: float = 0.1  # of a photo that no two others can be matched with: its edges still count
 
 
-def view_information(
-    points: Array, is_seen: NDArray[np.bool_], center: Array, focal_px: float, options: InformationOptions | None = None
-) -> Array:
-    """(C,3,3) information of one photo on the places (C,3) of components, 1/mm²; zero for those that it does not show.
+@dataclass(frozen=True)
+class Views:
+    """Photos, taken or possible, and what each tells of each component.
 
-    Args:
-        points: of the components, mm.
-        is_seen: (C,) which of them the photo shows.
-        center: (3,) of the camera, mm.
-        focal_px: its focal length.
-        options: see `InformationOptions`.
+    Attributes:
+        information: (V,C,3,3) on the places of the components, 1/mm²; zero for those that it does not show.
+        rays: (V,C,3) unit vectors from the components to the camera.
+        is_seen: (V,C) which components it shows.
     """
-    options = options or InformationOptions()
-    rays = points - center
-    square = np.maximum(np.sum(rays**2, axis=1), 1e-9)
-    across = np.eye(3) - rays[:, :, None] * rays[:, None, :] / square[:, None, None]
-    weight = is_seen * (focal_px / options.bearing_px) ** 2 / square
-    return np.asarray(across * weight[:, None, None])
+
+    information: Array
+    rays: Array
+    is_seen: NDArray[np.bool_]
+
+    def __len__(self) -> int:
+        return len(self.information)
+
+    def __getitem__(self, index: Sequence[int] | NDArray[np.int64] | slice) -> Views:
+        """Some of the views."""
+        return Views(self.information[index], self.rays[index], self.is_seen[index])
+
+    @staticmethod
+    def of(
+        points: Array, is_seen: NDArray[np.bool_], centers: Array, focal_px: float,
+        options: InformationOptions | None = None,
+    ) -> Views:  # fmt: skip
+        """The views of cameras at some places.
+
+        Args:
+            points: (C,3) of the components, mm.
+            is_seen: (V,C) which of them each photo shows.
+            centers: (V,3) of the cameras, mm.
+            focal_px: their focal length.
+            options: see `InformationOptions`.
+        """
+        options = options or InformationOptions()
+        away = np.reshape(centers, (-1, 1, 3)) - points
+        square = np.maximum(np.sum(away**2, axis=2), 1e-9)
+        rays = away / np.sqrt(square)[..., None]
+        across = np.eye(3) - rays[..., :, None] * rays[..., None, :]
+        weight = is_seen * (focal_px / options.bearing_px) ** 2 / square
+        return Views(across * weight[..., None, None], rays, np.asarray(is_seen, dtype=bool))
+
+
+class KnownViews:
+    """The photos taken, as information on the places of the components.
+
+    Attributes:
+        views: the photos.
+    """
+
+    def __init__(self, views: Views, options: InformationOptions | None = None) -> None:
+        """Begin with some photos; there may be none of them."""
+        self._options = options or InformationOptions()
+        self.views = views[:0]
+        count = views.is_seen.shape[1]
+        # Cosines to the nearest and second nearest other photo that shows the component.
+        self._nearest: Array = np.full((0, count, 2), _NO_COSINE)
+        for index in range(len(views)):
+            self.add(views[index : index + 1])
+
+    def add(self, view: Views) -> None:
+        """Count one more photo."""
+        cosines = self._cosines(view)[0]
+        own = np.sort(np.concatenate([np.full((2, cosines.shape[1]), _NO_COSINE), cosines]), axis=0)[-2:][::-1]
+        self._nearest = np.concatenate([self._nearer(cosines[None])[0], own.T[None]])
+        old = self.views
+        self.views = Views(
+            np.concatenate([old.information, view.information]), np.concatenate([old.rays, view.rays]),
+            np.concatenate([old.is_seen, view.is_seen]),
+        )  # fmt: skip
+
+    def information(self) -> Array:
+        """(C,3,3) of all photos together and of what is known before."""
+        weights = self._weights(self._nearest[..., 1])
+        return np.asarray(self._prior() + np.einsum("nc,ncij->cij", weights, self.views.information))
+
+    def with_each(self, views: Views) -> Array:
+        """(V,C,3,3) information with each one of some views added."""
+        cosines = self._cosines(views)
+        nearer = self._nearer(cosines)[..., 1]
+        own = np.full((len(views), views.is_seen.shape[1]), _NO_COSINE)
+        if len(self.views) >= 2:
+            own = np.partition(cosines, -2, axis=1)[:, -2]
+        known = np.einsum("vnc,ncij->vcij", self._weights(nearer), self.views.information, optimize=True)
+        return np.asarray(self._prior() + known + self._weights(own)[..., None, None] * views.information)
+
+    def _cosines(self, views: Views) -> Array:
+        """(V,N,C) cosines between views and photos at each component that both show."""
+        both = views.is_seen[:, None] & self.views.is_seen[None]
+        return np.where(both, np.einsum("vci,nci->vnc", views.rays, self.views.rays), _NO_COSINE)
+
+    def _nearer(self, cosines: Array) -> Array:
+        """(V,N,C,2) nearest and second nearest with each one of some views (V,N,C) added."""
+        first, second = self._nearest[..., 0], self._nearest[..., 1]
+        return np.stack(
+            [np.maximum(first, cosines), np.maximum(np.minimum(first, cosines), second)], axis=-1
+        )  # fmt: skip
+
+    def _weights(self, cosines: Array) -> Array:
+        """Weights of photos by the cosines to their second nearest one."""
+        o = self._options
+        angle_deg = np.rad2deg(np.arccos(np.clip(cosines, -1.0, 1.0)))
+        beyond = np.maximum(angle_deg - o.matched_deg, 0.0) / o.match_fall_deg
+        near = np.where(cosines > _NO_COSINE, np.exp(-(beyond**2)), 0.0)
+        return o.alone_weight + (1.0 - o.alone_weight) * near
+
+    def _prior(self) -> Array:
+        return prior_information(self.views.is_seen.shape[1], self._options)
 
 
 def prior_information(count: int, options: InformationOptions | None = None) -> Array:
@@ -71,25 +171,25 @@ def expected_error(information: Array, options: InformationOptions | None = None
     return np.asarray(options.coverage_factor * np.sqrt(np.sum(1.0 / values + options.common_mm**2, axis=-1)))
 
 
-def gains(known: Array, views: Array, weights: Array, options: InformationOptions | None = None) -> Array:
-    """(V,) by how much each of some views (V,C,3,3) lowers the weighted sum of expected errors of components.
+def gains(known: KnownViews, views: Views, weights: Array, options: InformationOptions | None = None) -> Array:
+    """(V,) by how much each of some views lowers the weighted sum of expected errors of components.
 
     Args:
-        known: (C,3,3) information of the photos taken.
-        views: information of each view.
+        known: the photos taken.
+        views: the views.
         weights: (C,) of the components, 1/mm: one over the tolerance.
         options: see `InformationOptions`.
     """
-    before = expected_error(known, options) @ weights
-    return np.asarray(before - expected_error(known + views, options) @ weights)
+    before = expected_error(known.information(), options) @ weights
+    return np.asarray(before - expected_error(known.with_each(views), options) @ weights)
 
 
 def choose_views(
-    known: Array,
-    views: Array,
+    taken: Views,
+    views: Views,
     weights: Array,
     directions: Array,
-    taken: Sequence[Array],
+    taken_directions: Sequence[Array],
     count: int,
     max_step_deg: float,
     options: InformationOptions | None = None,
@@ -100,32 +200,32 @@ def choose_views(
     view is taken.
 
     Args:
-        known: (C,3,3) information of the photos taken.
-        views: (V,C,3,3) information of the views.
+        taken: the photos taken.
+        views: the views to choose from.
         weights: (C,) of the components.
         directions: (V,3) unit vectors from the part to the views.
-        taken: unit vectors (3,) to the photos taken.
+        taken_directions: unit vectors (3,) to the photos taken.
         count: largest number of views.
         max_step_deg: see above.
         options: see `InformationOptions`.
     """
+    known = KnownViews(taken, options)
     left = np.ones(len(views), dtype=bool)
-    nearest = np.full(len(views), -1.0) if len(taken) == 0 else (directions @ np.array(taken).T).max(axis=1)
-    is_first = len(taken) == 0
+    nearest = np.full(len(views), -1.0)
+    if len(taken_directions):
+        nearest = (directions @ np.array(taken_directions).T).max(axis=1)
     chosen: list[int] = []
     while left.any() and len(chosen) < count:
-        value = gains(known, views, weights, options)
-        in_reach = left & (nearest >= np.cos(np.deg2rad(max_step_deg)))
-        if is_first:
-            best = int(np.argmax(np.where(left, value, -np.inf)))
-        elif in_reach.any():
-            best = int(np.argmax(np.where(in_reach, value, -np.inf)))
+        is_first = len(known.views) == 0
+        in_reach = left & (is_first | (nearest >= np.cos(np.deg2rad(max_step_deg))))
+        if in_reach.any():
+            some = np.flatnonzero(in_reach)
+            best = int(some[np.argmax(gains(known, views[some], weights, options))])
         else:
             best = int(np.argmax(np.where(left, nearest, -np.inf)))
-        is_first = False
         chosen.append(best)
         left[best] = False
-        known = known + views[best]
+        known.add(views[best : best + 1])
         nearest = np.maximum(nearest, directions @ directions[best])
     return chosen
 

@@ -12,12 +12,12 @@ from arview.camera import Camera
 from arview.capture.advice import ComponentNeed
 from arview.capture.dome import CaptureDome, component_points
 from arview.capture.information import (
+    KnownViews,
+    Views,
     choose_views,
     expanded_uncertainty,
     focal_px,
     gains,
-    prior_information,
-    view_information,
 )
 from arview.capture.options import CaptureOptions
 from arview.geometry import Array, apply
@@ -40,12 +40,12 @@ class CaptureNeeds:
         self._model, self._camera, self._dome, self._options = part.model, camera, dome, options
         self._points = component_points(part)
         self._center = part.model.center_in_model
-        count = len(part.model.components)
         self._is_asked = asked_components(part, options.components)
         self._weights = component_weights(part) * self._is_asked
-        self._known = prior_information(count, options.information)
-        self._seen: list[NDArray[np.bool_]] = []
-        self._eyes: list[Array] = []
+        self._known: KnownViews = KnownViews(dome.views[:0], options.information)
+        self._reach_mm: Array = expanded_uncertainty(
+            KnownViews(dome.views, options.information).information(), options.information
+        )
         self._directions: list[Array] = []
         self._tolerances = [part.component_settings(one.name).position_tolerance_mm for one in part.model.components]
         self.apart_deg = options.apart_share * dome.cell_deg
@@ -60,7 +60,7 @@ class CaptureNeeds:
     @property
     def photos(self) -> int:
         """Number of photos taken."""
-        return len(self._eyes)
+        return len(self._directions)
 
     @property
     def is_enough(self) -> bool:
@@ -82,9 +82,7 @@ class CaptureNeeds:
         seen = np.array(components_seen(self._model, self._camera, cam_from_model, self._options.coverage))
         eye = -cam_from_model[:3, :3].T @ cam_from_model[:3, 3]
         direction = unit(eye - self._center)
-        self._known = self._known + self._information(seen, eye)
-        self._seen.append(seen)
-        self._eyes.append(eye)
+        self._known.add(self._view(seen, eye))
         self._directions.append(direction)
         cell = self._dome.nearest(direction)
         if self._dome.directions[cell] @ direction >= np.cos(np.deg2rad(0.75 * self._dome.cell_deg)):
@@ -106,8 +104,8 @@ class CaptureNeeds:
         pixels = self._camera.project(apply(cam_from_model, self._points))
         size = np.array([self._camera.width, self._camera.height])
         inside = np.all((pixels > 0) & (pixels < size - 1), axis=1)
-        view = self._information(self._dome.is_seen[cell] & inside, eye)
-        return float(gains(self._known, view[None], self._weights, self._options.information)[0])
+        view = self._view(self._dome.is_seen[cell] & inside, eye)
+        return float(gains(self._known, view, self._weights, self._options.information)[0])
 
     def hidden_from(self, cell: int) -> list[str]:
         """Names of the components that lack photos and are not seen from a cell, the neediest first."""
@@ -124,13 +122,14 @@ class CaptureNeeds:
 
     # --- the parts -------------------------------------------------------------------------------------------
 
-    def _information(self, seen: NDArray[np.bool_], eye: Array) -> Array:
+    def _view(self, seen: NDArray[np.bool_], eye: Array) -> Views:
+        """The view of a camera at a place (3,) that shows some components (C,)."""
         focal = focal_px(self._camera) * self._options.photo_px_per_px
-        return view_information(self._points, seen, eye, focal, self._options.information)
+        return Views.of(self._points, seen[None], eye[None], focal, self._options.information)
 
     def _row(self, index: int, cell: int | None) -> ComponentNeed:
         u_mm, is_enough, can_be_seen = self._state
-        photos, directions = self._counts(index, self._seen, self._eyes)
+        photos, directions = self._counts(index, self._known.views)
         text = ""
         if not self._is_asked[index]:
             text = ""
@@ -146,33 +145,25 @@ class CaptureNeeds:
             self._model.components[index].name, photos, directions, predicted, bool(is_enough[index]), text
         )
 
-    def _counts(self, index: int, seen: Sequence[NDArray[np.bool_]], eyes: Sequence[Array]) -> tuple[int, int]:
+    def _counts(self, index: int, views: Views) -> tuple[int, int]:
         """Photos that show a component, and the directions of these that differ."""
-        rays = [eye - self._points[index] for one, eye in zip(seen, eyes, strict=True) if one[index]]
-        if not rays:
-            return 0, 0
-        return len(rays), count_separated(unit(np.array(rays)), self._options.coverage.direction_deg)
+        rays = views.rays[views.is_seen[:, index], index]
+        return len(rays), count_separated(rays, self._options.coverage.direction_deg)
 
-    def _assess(
-        self, known: Array | None = None, seen: Sequence[NDArray[np.bool_]] | None = None,
-        eyes: Sequence[Array] | None = None,
-    ) -> tuple[Array, NDArray[np.bool_], NDArray[np.bool_]]:  # fmt: skip
+    def _assess(self, known: KnownViews | None = None) -> tuple[Array, NDArray[np.bool_], NDArray[np.bool_]]:
         """For some photos, by default those taken: (C,) U, which components have enough, and which can be seen."""
         o = self._options
-        known = self._known if known is None else known
-        seen = self._seen if seen is None else seen
-        eyes = self._eyes if eyes is None else eyes
-        u_mm = expanded_uncertainty(known, o.information)
-        reach_mm = expanded_uncertainty(self._known + self._dome.information.sum(axis=0), o.information)
+        known = known or self._known
+        u_mm = expanded_uncertainty(known.information(), o.information)
         cells = self._dome.is_seen.sum(axis=0)
         is_enough = np.zeros(len(u_mm), dtype=bool)
         can_be_seen = cells > 0
         for index, tolerance in enumerate(self._tolerances):
-            photos, directions = self._counts(index, seen, eyes)
+            photos, directions = self._counts(index, known.views)
             can_be_seen[index] |= photos > 0
             if not can_be_seen[index]:
                 continue
-            goal_mm = max(o.reach_share * float(reach_mm[index]), o.u_share * (tolerance or 0.0))
+            goal_mm = max(o.reach_share * float(self._reach_mm[index]), o.u_share * (tolerance or 0.0))
             wanted = min(o.coverage.photos_wanted, photos + int(cells[index]))
             is_enough[index] = (
                 photos >= wanted and directions >= min(o.coverage.directions_wanted, wanted) and u_mm[index] <= goal_mm
@@ -197,25 +188,21 @@ class CaptureNeeds:
         cells = np.flatnonzero(is_open)
         if len(cells) == 0:
             return
-        informations, directions = self._dome.information[cells], self._dome.directions[cells]
-        value = gains(self._known, informations, self._weights, o.information)
+        views, directions = self._dome.views[cells], self._dome.directions[cells]
         order = choose_views(
-            self._known, informations, self._weights, directions, self._directions,
+            self._known.views, views, self._weights, directions, self._directions,
             min(len(cells), o.max_photos - self.photos), o.max_step_deg, o.information,
         )  # fmt: skip
-        self.best_gain = float(value.max())
+        self.best_gain = float(gains(self._known, views, self._weights, o.information).max())
         self.plan = self._until_enough([int(cells[index]) for index in order])
 
     def _until_enough(self, order: list[int]) -> list[int]:
         """The first cells of an order that suffice."""
-        known, seen, eyes = self._known, list(self._seen), list(self._eyes)
-        middle_mm = float(np.sqrt(self._dome.distance_mm[0] * self._dome.distance_mm[1]))
+        known = KnownViews(self._known.views, self._options.information)
         for index, cell in enumerate(order):
-            known = known + self._dome.information[cell]
-            seen.append(self._dome.is_seen[cell])
-            eyes.append(self._center + middle_mm * self._dome.directions[cell])
-            is_near_end = len(eyes) >= self._options.wanted_photos
-            if is_near_end and self._suffices(len(eyes), self._assess(known, seen, eyes)):
+            known.add(self._dome.views[cell : cell + 1])
+            is_near_end = len(known.views) >= self._options.wanted_photos
+            if is_near_end and self._suffices(len(known.views), self._assess(known)):
                 return order[: index + 1]
         return order
 

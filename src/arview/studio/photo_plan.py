@@ -11,7 +11,7 @@ from arview.cad.check import GUESSED_CAMERA
 from arview.cad.part import Part
 from arview.camera import Camera
 from arview.capture.dome import asked_elevation_deg, component_points, fitting_distance_mm
-from arview.capture.information import expanded_uncertainty, focal_px, prior_information, view_information
+from arview.capture.information import KnownViews, Views, expanded_uncertainty, focal_px
 from arview.capture.options import CaptureOptions
 from arview.errors import InputError
 from arview.geometry import Array, look_at
@@ -46,8 +46,7 @@ def photo_plan(part: Part, count: int, camera: Camera | None = None) -> dict[str
     up = view_range.up_in_model
     seen = np.array([components_seen(model, camera, look_at(eye, model.center_in_model, up)) for eye in eyes])
     points = component_points(part)
-    views = [view_information(points, row, eye, focal_px(camera)) for row, eye in zip(seen, eyes, strict=True)]
-    expected_mm = expanded_uncertainty(prior_information(len(points)) + np.sum(views, axis=0))
+    expected_mm = expanded_uncertainty(KnownViews(Views.of(points, seen, eyes, focal_px(camera))).information())
     return {
         "distance_mm": distance_mm,
         "photos": [
