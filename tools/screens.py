@@ -252,6 +252,7 @@ def photograph(chromium: Any, server: Running, shot: Shot, path: Path) -> list[s
         page.wait_for_timeout(700)
         page.screenshot(path=path)
     finally:
+        page.unroute_all(behavior="ignoreErrors")
         context.close()
         TOLD.update({"components": {}, "more": {}})
     return errors
@@ -261,7 +262,7 @@ def sheets(pictures: list[tuple[str, Path]], folder: Path) -> list[Path]:
     """Contact sheets of named pictures."""
     height = round(TILE_PX * PHONE[1] / PHONE[0])
     font = ImageFont.load_default(16)
-    made = []
+    made: list[Path] = []
     for first in range(0, len(pictures), COLUMNS * ROWS):
         sheet = Image.new("RGB", (COLUMNS * TILE_PX, ROWS * (height + CAPTION_PX)), (70, 74, 82))
         for i, (name, path) in enumerate(pictures[first : first + COLUMNS * ROWS]):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -11,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image as PilImage
 
 from helpers import live_browser
 from helpers.live_browser import closed, difference_mask, number_in, outline_errors_px, screenshot, true_mask
@@ -75,6 +77,7 @@ def opened(
         page.goto(f"http://127.0.0.1:{server.port}/?token={server.token}")
         yield page
     finally:
+        page.unroute_all(behavior="ignoreErrors")
         context.close()
     assert not errors
 
@@ -150,7 +153,7 @@ def test_every_control_has_a_name_and_german_is_complete(chromium: Any, station:
     ],
 )
 def test_looks_follow_the_device_and_can_be_read(
-    chromium: Any, station: Running, settings: dict[str, str], theme: str, ratio: float
+    chromium: Any, station: Running, settings: dict[str, Any], theme: str, ratio: float
 ) -> None:
     with opened(chromium, station, **settings) as page:
         assert page.evaluate("document.documentElement.dataset.theme") == theme
@@ -212,7 +215,7 @@ def test_the_overlay_is_exact_under_zoom(chromium: Any, station: Running) -> Non
 
         def seen() -> np.ndarray:
             """What is in view between the bars."""
-            shown = np.array(live_browser.PilImage.open(live_browser.io.BytesIO(page.screenshot())).convert("RGB"))
+            shown = np.array(PilImage.open(io.BytesIO(page.screenshot())).convert("RGB"))
             return shown[rows, columns]
 
         bar, actions = (page.locator(name).bounding_box() for name in ("#bar", "#zoom"))
