@@ -201,7 +201,7 @@ export class CaptureView {
     const share = Math.round(100 * (advice?.progress ?? 0));
     this.bar.style.width = `${share}%`;
     this.meter.setAttribute("aria-valuenow", String(share));
-    put(this.count, this.wanted ? t("job.photos_of", { photos: stored + waiting, wanted: this.wanted }) : t("job.photos", { photos: stored + waiting }));
+    put(this.count, this.wanted >= stored + waiting ? t("job.photos_of", { photos: stored + waiting, wanted: this.wanted }) : t("job.photos", { photos: stored + waiting }));
     put(this.state, this.#stateText(waiting, stored));
     this.state.classList.toggle("bad", Boolean(queue.trouble) || queue.refused(job.id).length > 0);
     this.element.classList.toggle("is-enough", isEnough);

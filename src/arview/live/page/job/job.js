@@ -12,6 +12,7 @@ import { ResultsView } from "./results.js";
 import { StartView, numberOf } from "./start.js";
 import "./texts.js";
 
+const STALE_MS = 15_000; // without an answer for so long, what is shown is called old
 const POLL_MS = 2000, BIND_MS = 1500, JOBS_MS = 5000;
 const KEY = "arview-job", ENDING_KEY = "arview-job-ending";
 
@@ -25,7 +26,7 @@ class JobPage {
   #boundMs = -Infinity;
   #refreshedMs = -Infinity;
   #isRefreshing = false;
-  #isStale = false;
+  #heardMs = performance.now(); // when the station has answered last
   #rechecks = [];
 
   constructor(host) {
@@ -202,13 +203,12 @@ class JobPage {
     const { id } = this.job;
     try {
       const job = await api.getJob(id);
-      this.#isStale = false;
+      this.#hear();
       if (this.job?.id !== id) return;
       this.job = job;
       await this.#refreshRechecks();
     } catch (error) {
       if (error.code === undefined) throw error;
-      this.#isStale = true;
     } finally {
       this.#isRefreshing = false;
       this.#refreshedMs = performance.now();
@@ -230,13 +230,12 @@ class JobPage {
     this.jobsMs = performance.now();
     try {
       this.jobs = await api.listJobs();
-      this.#isStale = false;
+      this.#hear();
     } catch (error) {
       if (error.code === undefined) throw error;
-      this.#isStale = true;
     }
     this.start.setJobs(this.jobs);
-    this.stale.hidden = !this.#isStale;
+    this.#showStale();
   }
 
   #queueChanged() {
@@ -284,9 +283,18 @@ class JobPage {
     return this.host.state.part ? numberOf(this.job, this.host.state.part) : 0;
   }
 
+  #hear() {
+    this.#heardMs = performance.now();
+    this.#showStale();
+  }
+
+  #showStale() {
+    this.stale.hidden = performance.now() - this.#heardMs < STALE_MS;
+  }
+
   #draw() {
     const { job } = this;
-    this.stale.hidden = !this.#isStale;
+    this.#showStale();
     if (!job) return;
     const { part } = this.host.state;
     if (this.#view === "capture" && (part?.part || part?.parts)) {

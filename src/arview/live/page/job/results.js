@@ -65,7 +65,7 @@ export class ResultsView {
     const bar = make("progress", "", [], { max: "100", "aria-label": t("job.measuring") });
     if (share !== null) bar.value = share;
     const lines = waiting ? t("job.sending", { waiting }) : state.text || t("job.measuring");
-    const placed = state.photos ? t("job.placed", { placed: state.placed ?? 0, photos: state.photos }) : "";
+    const placed = state.placed ? t("job.placed", { placed: state.placed, photos: state.photos }) : "";
     return make("div", "job-progress", [make("p", "", [icon("busy"), lines]), bar, make("p", "job-quiet", [placed])], { role: "status" });
   }
 
