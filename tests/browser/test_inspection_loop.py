@@ -43,12 +43,10 @@ def test_whole_inspection(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
     )  # fmt: skip
     script = WATCH + camera_script(is_numbered=True)
 
-    def load() -> Any:
-        return load_subjects([str(PLATE / "part.toml")], None, None, chosen)
-
+    subjects = load_subjects([str(PLATE / "part.toml")], None, None, chosen)
     with (
         live_browser.browser(None) as chromium,
-        running(chosen, load) as server,
+        running(chosen, lambda: subjects) as server,
         opened(chromium, server, script, PHONE) as page,
     ):
         inspector = Inspector(page, walk, lambda step, seconds: print(f"{step}: {seconds:.1f} s"))
