@@ -66,7 +66,7 @@ export class ComponentView {
     ];
   }
 
-  #rework(job, name, { moves = [], turn, steps = [], remark, pictures = [], how }, ticks) {
+  #rework(job, name, { moves = [], turn, text = "", place = "", steps = [], remark, pictures = [], how }, ticks) {
     const title = make("h3", "", [t("job.rework"), ...(how ? [make("small", "", [how])] : [])]);
     const list = moves.map((one) => make("li", "move", [icon("displaced"), make("b", "", [one.text])]));
     if (turn) list.push(make("li", "move", [icon("displaced"), make("b", "", [typeof turn === "string" ? turn : turn.text])]));
@@ -90,7 +90,7 @@ export class ComponentView {
     const again = make("button", "wide primary", [icon("camera"), t("job.check_again")]);
     again.addEventListener("click", () => this.events.onRecheck(name));
     return [
-      title, make("ul", "job-moves", list), ...(remark ? [make("p", "job-remark", [icon("warning"), remark])] : []), drawing, ...more,
+      title, ...[text, place].filter(Boolean).map((one) => make("p", "", [one])), make("ul", "job-moves", list), ...(remark ? [make("p", "job-remark", [icon("warning"), remark])] : []), drawing, ...more,
       ...(boxes.length ? [who.field, make("ol", "job-steps", boxes)] : []), ...(job.state.stage === "done" ? [again] : []),
     ];
   }
