@@ -85,7 +85,7 @@ def run(chromium: Any, link: str, out: Path, serial: str, patience_s: float) -> 
             inspector.decide(one["name"], is_ok, "Reworked and checked again" if is_ok else "Not reworked yet", BY)
     inspector.sign(BY)
     picture("4_signed")
-    (out / "report.html").write_text(inspector.report(), encoding="utf-8")
+    (out / "report.html").write_text(inspector.report(BY), encoding="utf-8")
     context.close()
 
 

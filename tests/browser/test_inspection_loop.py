@@ -68,7 +68,7 @@ def test_whole_inspection(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
             is_ok = name == COMPONENT
             inspector.decide(name, is_ok, "Reworked and checked again" if is_ok else "Not reworked", BY)
         inspector.sign(BY)
-        report = inspector.report()
+        report = inspector.report(BY)
         job = inspector.job()
     assert BY in report and "Reworked and checked again" in report
     assert job["signed"]["by"] == BY

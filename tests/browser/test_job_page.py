@@ -200,7 +200,7 @@ def test_result_comes_without_a_reload_and_is_signed(chromium: Any, server: Runn
         page.locator("#job .job-form .primary").click()
         until(page, lambda: "Not OK by M. Lang" in page.inner_text("#job .component[data-name=post_1]"))
         page.locator("#job .job-ends .primary").click()
-        assert "nut_1" in page.inner_text("#job .job-view .job-remark"), "who signs is told what has no decision"
+        assert "nut_1" in page.inner_text("#job .job-form"), "who signs is told what has no decision"
         page.locator("#job .primary").click()
         until(page, lambda: "Signed by M. Lang" in page.inner_text("#job"))
         jobs.is_gone = True

@@ -291,10 +291,14 @@ class Inspector:
         self.page.locator("#job .job-form .primary").click()
         self.until(lambda: "Signed by" in self.page.inner_text("#job"), "the signature")
 
-    def report(self) -> str:
-        """The report of the job."""
-        return str(
-            self.page.evaluate(
-                "async () => (await fetch(`/api/jobs/${localStorage.getItem('arview-job')}/report.html`)).text()"
-            )
-        )
+    def report(self, by: str) -> str:
+        """The report of the job; waits until the signature is in it."""
+        address = "`/api/jobs/${localStorage.getItem('arview-job')}/report.html`"
+        found = [""]
+
+        def is_signed() -> bool:
+            found[0] = str(self.page.evaluate(f"async () => (await fetch({address})).text()"))
+            return by in found[0]
+
+        self.until(is_signed, "the report with the signature")
+        return found[0]

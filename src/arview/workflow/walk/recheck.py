@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from arview.cad import Part
 from arview.camera import Camera
 from arview.core.stage_cache import write_json
-from arview.errors import ArviewError, CannotMeasureError, InputError
+from arview.errors import CannotMeasureError, InputError
 from arview.geometry import Array
 from arview.inspection import ComponentDeviation, Inspection, load_inspection, save_inspection
 from arview.inspection.summary import verdict_sentence
@@ -153,14 +153,6 @@ class RecheckWorker(WalkWorker):
         checked = tuple(one for one in inspection.components if one.name in (self.job.components or ()))
         super()._say_verdict(inspection, was_done)
         self._say(text=verdict_sentence(replace(inspection, components=checked)))
-
-    def _report(self, part: Part) -> None:
-        from arview.report import make_report
-
-        try:
-            make_report(self.job.path / "inspection.json", self.job.path / "report.html", None, part)
-        except ArviewError as error:
-            self._say(text=f"{self.state.text}; no report: {error}")
 
 
 def read_first(first: JobFolder) -> tuple[ScaleResult, SparseModel, list[Photo]]:

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from typing import Any
 
+from arview.cad import Part
 from arview.core.progress import Progress
 from arview.errors import ArviewError, InputError, MismatchError
 from arview.inspection import Inspection, save_inspection
@@ -158,6 +159,8 @@ class WalkWorker:
             first.append(inspection)
             self._say_verdict(inspection, was_done)
             os.nice(max(0, self.options.background_niceness - os.nice(0)))
+            if not was_done or not (self.job.path / "report.html").is_file():
+                self._report(prepared.part)  # without the cloud, so that there is one to decide and sign in
 
         if not was_done:
             self._say(stage="measuring", text="measuring", photos=len(photos), cloud="waiting")
@@ -182,6 +185,15 @@ class WalkWorker:
             stage="done", text=verdict_sentence(inspection), is_rough=False, inspection="inspection.json",
             placed=inspection.provenance.photos, seconds_after_last_photo=seconds, cloud="running", step="",
         )  # fmt: skip
+
+    def _report(self, part: Part) -> None:
+        """Write the report of what is measured."""
+        from arview.report import make_report
+
+        try:
+            make_report(self.job.path / "inspection.json", self.job.path / "report.html", None, part)
+        except ArviewError as error:
+            self._say(text=f"{self.state.text}; no report: {error}")
 
     def _say_cloud(self, first: Inspection, outcome: Outcome) -> None:
         """The end of the background's work; a verdict that it changed is named."""
