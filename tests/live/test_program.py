@@ -77,7 +77,7 @@ def test_it_serves_until_ctrl_c_and_finishes_the_recording(tmp_path: Path) -> No
         assert scheme == "http"
         page = Http(port, token)
         ends_s = time.monotonic() + 120
-        while page.json("GET", "/api/status")[1]["feed"]["width"] is None or not list(tmp_path.iterdir()):
+        while page.json("GET", "/api/status")[1]["feed"]["width"] is None or not list(tmp_path.glob(".out.mp4*")):
             assert time.monotonic() < ends_s  # until the first frame is tracked and recorded
             time.sleep(0.1)
         time.sleep(0.5)
