@@ -31,8 +31,8 @@ _NO_COSINE = -2.0
 class InformationOptions:
     """Errors of one photo and of all photos together."""
 
-    bearing_px: float = 0.24  # standard deviation of a component's direction in one photo: edges, patches and pose
-    common_mm: float = 0.006  # standard deviation that more photos do not lower: form, lens, datums
+    bearing_px: float = 0.12  # standard deviation of a component's direction in one photo: edges, patches and pose
+    common_mm: float = 0.02  # standard deviation that more photos do not lower: datums, methods that differ, form
     prior_mm: float = 5.0  # standard deviation of a place before any photo
     coverage_factor: float = 2.0  # k of the expanded uncertainty
     matched_deg: float = 30.0  # angle to the second nearest photo up to which a photo counts in full …
