@@ -63,7 +63,7 @@ def checked_again(job: JobFolder, arguments: argparse.Namespace) -> dict[str, An
     paths, _ = photo_paths(arguments.recheck_photos or arguments.photos)
     chosen = paths if arguments.recheck_photos else paths[1::4]
     with start_worker(recheck) as worker:
-        while recheck.state().text != "waiting for photos" and worker.poll() is None:
+        while not _is_ready(recheck) and worker.poll() is None:
             time.sleep(0.1)
         for path in chosen:
             content = path.read_bytes()
@@ -80,6 +80,12 @@ def checked_again(job: JobFolder, arguments: argparse.Namespace) -> dict[str, An
         "stage": state.stage, "text": state.text,
         "before_after_mm": {one.name: (one.before_mm, one.after_mm) for one in before_after(recheck)},
     }  # fmt: skip
+
+
+def _is_ready(recheck: JobFolder) -> bool:
+    """Whether the worker has read the first measurement."""
+    state = recheck.state()
+    return bool(state.updated) and state.text == "waiting for photos"
 
 
 def walk(job: JobFolder, arguments: argparse.Namespace) -> dict[str, Any]:

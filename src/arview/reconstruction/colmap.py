@@ -114,7 +114,7 @@ def sparse_model_of(
         (image for image in reconstruction.images.values() if image.has_pose and image.name in given),
         key=lambda image: order[image.name],
     )
-    place_of = {image.image_id: place for place, image in enumerate(images)}
+    place_of = {image.image_id: index for index, image in enumerate(images)}
     posed = []
     for image in images:
         matrix = np.asarray(image.cam_from_world().matrix())
@@ -122,22 +122,27 @@ def sparse_model_of(
         photo = given[image.name]
         posed.append(PosedPhoto(photo.name, photo.path, camera, rigid(matrix[:, :3], matrix[:, 3]), photo.mask))
     point_ids = sorted(reconstruction.points3D)
-    seen_point, seen_photo, seen_px = [], [], []
-    for row, point_id in enumerate(point_ids):
-        for element in reconstruction.points3D[point_id].track.elements:
-            if element.image_id in place_of:
-                seen_point.append(row)
-                seen_photo.append(place_of[element.image_id])
-                seen_px.append(reconstruction.images[element.image_id].points2D[element.point2D_idx].xy)
     points = [reconstruction.points3D[point_id] for point_id in point_ids]
+    seen: list[tuple[int, int, int]] = []  # point, photo, index of the feature in the photo
+    for row, point in enumerate(points):
+        for element in point.track.elements:
+            place = place_of.get(element.image_id)
+            if place is not None:
+                seen.append((row, place, element.point2D_idx))
+    observed_point, observed_photo, feature = np.array(seen, dtype=np.int64).reshape(-1, 3).T
+    observed_px = np.empty((len(seen), 2))
+    for place, image in enumerate(images):
+        mine = observed_photo == place
+        if mine.any():
+            observed_px[mine] = np.array([one.xy for one in image.points2D])[feature[mine]]
     return SparseModel(
         photos=tuple(posed),
         points_in_scan=np.array([point.xyz for point in points]).reshape(-1, 3),
         colors=np.array([point.color for point in points], dtype=np.uint8).reshape(-1, 3),
         point_errors_px=np.array([point.error for point in points], dtype=np.float64),
-        observed_point=np.array(seen_point, dtype=np.int32),
-        observed_photo=np.array(seen_photo, dtype=np.int32),
-        observed_px=np.array(seen_px, dtype=np.float64).reshape(-1, 2) - HALF_PX,
+        observed_point=observed_point.astype(np.int32),
+        observed_photo=observed_photo.astype(np.int32),
+        observed_px=observed_px - HALF_PX,
         unplaced=tuple(unplaced),
     )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import shutil
 from collections.abc import Mapping, Sequence
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 from arview.cad import Part
 from arview.camera import Camera
 from arview.core.stage_cache import write_json
-from arview.errors import CannotMeasureError, InputError
+from arview.errors import ArviewError, CannotMeasureError, InputError
 from arview.geometry import Array
 from arview.inspection import ComponentDeviation, Inspection, load_inspection, save_inspection
 from arview.inspection.summary import verdict_sentence
@@ -61,6 +62,8 @@ class RecheckWorker(WalkWorker):
 
     def _wait_for_first_photo(self) -> Prepared:
         """Make the earlier photos ready, which needs none of the new ones."""
+        if self.state.stage == "done":
+            return prepared_of(self.first)
         self._say(text="reading the first measurement")
         prepared = prepared_of(self.first)
         check_not_datums(prepared.part, self.job.components or ())
@@ -69,13 +72,13 @@ class RecheckWorker(WalkWorker):
         hides = Hides(prepared.part, before, self.job.components or (), whole, self.scale)
         options = AddedOptions(sparse=prepared.reconstruct.sparse)
         self.earlier = EarlierPhotos(whole, photos, hides, options, self.memory)
-        self._say(text="waiting for photos")
         super()._wait_for_first_photo()
         return prepared
 
     def _prepare_more(self, photos: Sequence[Photo]) -> None:
         """Match new photos with those of the first measurement."""
-        assert self.earlier is not None
+        if self.earlier is None:
+            return
         sparse = self.earlier.options.sparse
         features = [self.memory.features(photo, sparse.features, torch_device(sparse.device)) for photo in photos]
         poses = {name: self._from_scan(pose) for name, pose in poses_of(self.job.photos()).items()}
@@ -153,6 +156,14 @@ class RecheckWorker(WalkWorker):
         checked = tuple(one for one in inspection.components if one.name in (self.job.components or ()))
         super()._say_verdict(inspection, was_done)
         self._say(text=verdict_sentence(replace(inspection, components=checked)))
+
+    def _report(self, part: Part) -> None:
+        """Write the report, and what the first measurement's report says of re-checks."""
+        from arview.report.decisions import update_reports
+
+        super()._report(part)
+        with contextlib.suppress(ArviewError):
+            update_reports(self.first.path)
 
 
 def read_first(first: JobFolder) -> tuple[ScaleResult, SparseModel, list[Photo]]:

@@ -83,10 +83,12 @@ class WalkWorker:
             kept = None if path is None else path.relative_to(self.job.path).as_posix()
             is_rough = kept is not None and kept != "inspection.json"
             self.state = WalkState(photos=len(self.job.photos()), is_rough=is_rough, inspection=kept)
-            self._say(text="waiting for photos")
+            self._say(text="starting")
 
     def _wait_for_first_photo(self) -> Prepared:
         """The inputs of the measurement, which can be checked from the first photo on."""
+        if self.state.stage == "collecting":
+            self._say(text="waiting for photos")
         while not self.job.photos():
             if self.job.is_ended:
                 raise InputError(f"job {self.job.id}: the walk ended without a photo; reopen it and take some")
