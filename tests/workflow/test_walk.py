@@ -140,7 +140,8 @@ def test_a_component_put_right_is_checked_again(measured: JobFolder, station: St
     assert right.verdict in (Verdict.PASS, Verdict.UNDECIDED)
     assert right.distance_mm is not None and right.uncertainty_mm is not None
     assert right.distance_mm < min(0.4, 2.0 * right.uncertainty_mm)
-    assert right.details is not None and right.details.photos <= len(AGAIN)
+    assert right.details is not None and right.details.photos is not None
+    assert 3 <= right.details.photos <= len(AGAIN)
     others = [one for name, one in by_name.items() if name != "block_2"]
     assert len(others) == 3 and {one.verdict for one in others} == {Verdict.NOT_MEASURED}
     (change,) = before_after(recheck, model)
