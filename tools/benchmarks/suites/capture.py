@@ -76,7 +76,7 @@ def capture_rows(sets: Sequence[PhotoSet], folder: Path, details: dict[str, Any]
     if ratios:
         u, error = np.exp(np.mean(np.log(ratios), axis=0))
         text = f"U {100 * (u - 1):+.0f} %, true error {100 * (error - 1):+.0f} % (geometric mean of {len(ratios)})"
-        rows.append(ResultRow("chosen views", "all", text, "U ≥ 20 % smaller than at random", u <= 1.0 - TARGET))
+        rows.append(ResultRow("chosen views", "all", text, "U ≥ 20 % smaller than at random", bool(u <= 1.0 - TARGET)))
     return rows
 
 
@@ -182,4 +182,4 @@ def _compared(
     )
     if failed:
         text += f"; {len(failed)} random choices cannot be measured"
-    return ResultRow("chosen views", on, text, target, ratio[0] <= 1.0 - TARGET), ratio
+    return ResultRow("chosen views", on, text, target, bool(ratio[0] <= 1.0 - TARGET)), ratio
