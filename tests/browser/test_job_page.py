@@ -9,9 +9,8 @@ from typing import Any
 
 import pytest
 
-from arview.live.server import app
+from arview.live.server import clients
 from arview.live.stream import documents
-from arview.live.transport import webrtc
 from helpers import live_browser
 from helpers.live_client import Running, running
 from helpers.live_sample import INSPECTION, loader, options
@@ -43,8 +42,7 @@ def server() -> Iterator[Running]:
         return {**plain(*of, **more), **({"capture": dict(ADVICE)} if ADVICE else {})}
 
     with pytest.MonkeyPatch.context() as patch:
-        for module in (app, webrtc):
-            patch.setattr(module, "pose_document", told)
+        patch.setattr(clients, "pose_document", told)
         chosen = options(inspection=None, clients=4)
         with running(chosen, loader(chosen)) as one:
             yield one

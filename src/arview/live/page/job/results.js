@@ -69,13 +69,16 @@ export class ResultsView {
     return make("div", "job-progress", [make("p", "", [icon("busy"), lines]), bar, make("p", "job-quiet", [placed])], { role: "status" });
   }
 
-  #banner({ state, inspection }) {
-    const { components, verdict, sentence } = inspection, isRough = Boolean(state.is_rough) || state.stage !== "done";
+  #banner({ state, inspection, components: checked }) {
+    // A check again is about its own components only.
+    const components = inspection.components.filter((one) => !checked || checked.includes(one.name));
+    const verdict = checked ? bySeverity(components)[0]?.verdict : inspection.verdict, sentence = checked ? "" : inspection.sentence;
+    const isRough = Boolean(state.is_rough) || state.stage !== "done";
     const list = counts(components).map(([kind, count]) => make("span", `count ${kind}`, [icon(kind), `${count} ${verdictWord(kind)}`]));
     const words = [make("b", "", [isRough ? t("job.provisional") : verdictWord(verdict)])];
     return make("div", `job-banner ${isRough ? "rough" : verdict}`, [
       make("div", "what", [isRough ? icon("busy") : icon(verdict), ...words]),
-      make("p", "", [isRough ? t("job.rough") : sentence ?? ""]), make("div", "tally", list),
+      ...(isRough || sentence ? [make("p", "", [isRough ? t("job.rough") : sentence])] : []), make("div", "tally", list),
     ], { role: "status" });
   }
 

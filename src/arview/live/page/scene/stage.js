@@ -17,6 +17,7 @@ const NEUTRAL = "#46c4ff", CONTEXT = "#e2e8f0", CONTEXT_ALPHA = 0.5;
 const HATCH_ALPHA = 0.75; // the lines of a hatched ghost cover little
 const DIMMED = 0.45; // factor of the opacity of ghosts that the pictures do not verify
 const PATTERNS = { missing: 2, displaced: 1 };
+const COVERED = 0.55; // with less of the stage free than this share, the picture avoids all that covers it
 const ROOMY = 0.8; // the picture avoids the bars if it keeps this fraction of its size
 const MARGIN_PX = 8;
 const NO_EVIDENCE = { key: "", labels: new Map(), legend: [], withheld: [] };
@@ -221,7 +222,8 @@ export class Stage {
     const { whole, free } = (this.#areas ??= this.#measured());
     const fit = (area) => Math.min(area.width / frame.width, area.height / frame.height);
     const isFollowing = this.isFollowing && !isAnnotated; // labels that the station has drawn must stay in view
-    const isRoomy = this.viewport.isManual || isFollowing || fit(free) >= ROOMY * fit(whole), area = isRoomy ? free : whole;
+    const isCovered = free.width * free.height < COVERED * whole.width * whole.height; // by the side sheet: the part would be behind it
+    const isRoomy = this.viewport.isManual || isFollowing || isCovered || fit(free) >= ROOMY * fit(whole), area = isRoomy ? free : whole;
     const { left, top, scale } = this.viewport.place(frame, area, isFollowing ? this.#boxOf(pose, frame) : null, !this.calm.matches);
     const width = frame.width * scale, height = frame.height * scale, old = this.#place;
     // Of the picture only this is seen: the bars cover the rest.
