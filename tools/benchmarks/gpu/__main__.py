@@ -22,11 +22,11 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[3]
 HERE = Path(__file__).resolve().parent
-sys.path[:0] = [str(ROOT / "tests"), str(HERE)]
+sys.path[:0] = [str(ROOT / "tests"), str(HERE.parent)]
 
-from clock import Row
-from comparisons import dense_rows, feature_rows, matching_rows
-from drawing import renderer_rows
+from gpu.clock import Row
+from gpu.comparisons import dense_rows, feature_rows, matching_rows
+from gpu.drawing import renderer_rows
 
 SECTIONS = {"renderers": renderer_rows, "features": feature_rows, "matching": matching_rows, "dense": dense_rows}
 

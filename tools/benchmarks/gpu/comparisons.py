@@ -9,7 +9,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from clock import Row, timed
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
@@ -24,6 +23,7 @@ from arview.reconstruction.intake import read_photo
 from arview.reconstruction.matching import Matches, match_along_lines, match_descriptors
 from arview.reconstruction.sparse import SparseOptions, reconstruct_from_poses
 from arview.reconstruction.types import Photo, SparseModel
+from gpu.clock import Row, timed
 from helpers.photo_scene import CAMERA, bench, photograph, ring, write_photos
 
 PHOTO = Path(__file__).resolve().parents[3] / "samples" / "plate" / "photos" / "img_000.jpg"

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 
 import numpy as np
-from clock import Row
 
 from arview.cad import Component, Model, make_model
 from arview.errors import MissingDependencyError
@@ -13,6 +12,7 @@ from arview.guideviews.sphere import icosphere_directions, view_poses
 from arview.guideviews.views import guide_camera
 from arview.rendering.pyrender_renderer import gl_name
 from arview.rendering.renderers import open_renderer
+from gpu.clock import Row
 
 SIZES = ((100, 95), (400, 250))  # steps around and along the ring: 19,000 and 200,000 triangles
 SUBDIVISIONS, ROUNDS = 2, 3  # 162 views, drawn three times by each

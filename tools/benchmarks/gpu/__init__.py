@@ -1,0 +1,1 @@
+"""Checks and timings of all that a GPU can do."""
