@@ -285,7 +285,10 @@ class Inspector:
         return self.measure("last photo to the verdict of the check again")
 
     def sign(self, by: str) -> None:
-        """Sign the result."""
+        """Sign the result, when cloud and report are there: a signature before would not hold."""
+        begun_s = time.monotonic()
+        self.until(lambda: self.page.locator("#job .job-ends .primary:enabled").count(), "the cloud and the report")
+        self.timed("until cloud and report are there", begun_s)
         self.page.locator("#job .job-ends .primary").click()
         self.page.fill("#job-sign-by", by)
         self.page.locator("#job .job-form .primary").click()

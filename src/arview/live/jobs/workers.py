@@ -113,7 +113,7 @@ class WorkerQueue:
                     self._ended(entry)
             running = [entry for entry in self._entries.values() if entry.is_running]
             waiting = [entry for entry in self._entries.values() if not entry.is_running and self._may_start(entry)]
-            self._rest(running, bool(waiting))
+            self._rest(running, bool(waiting), any(not _is_only_cloud(one) for one in waiting))
             free = self._options.workers - len(running)
             for entry in sorted(waiting, key=_urgency)[: max(0, free)]:
                 self._begin(entry)
@@ -146,14 +146,19 @@ class WorkerQueue:
             return False
         return entry.asked_s > entry.served_s or _is_only_cloud(entry)
 
-    def _rest(self, running: list[_Entry], others_wait: bool) -> None:
-        """Stop workers that only wait, or only make a cloud, when others have work; and all that wait for long."""
+    def _rest(self, running: list[_Entry], others_wait: bool, others_measure: bool) -> None:
+        """Stop workers that only wait when others have work, and those that only make a cloud when others measure.
+
+        One that makes a cloud goes on beside others of its kind: they would stop each other without end. All that
+        wait for long are stopped, too.
+        """
         now_s = time.monotonic()
         for entry in running:
             state = entry.job.state()
             quiet_s = now_s - max(entry.asked_s, entry.started_s)
             is_idle = state.stage == "collecting" and not entry.job.is_ended
-            makes_room = others_wait and (_is_only_cloud(entry) or (is_idle and quiet_s > self._options.patience_s))
+            is_patient = is_idle and quiet_s > self._options.patience_s
+            makes_room = (others_measure and _is_only_cloud(entry)) or (others_wait and is_patient)
             if not entry.stopping and (makes_room or (is_idle and quiet_s > self._options.idle_s)):
                 logger.info("the measurement of %s is set aside", entry.job.id)
                 entry.stopping = True

@@ -167,7 +167,6 @@ export function signForm(job, { onSign, onBack, onTrouble }) {
   const form = make("form", "job-form job-view", [
     make("div", "job-head", [back, make("h3", "", [t("job.sign")])]),
     make("p", "", [t("job.sign_what", { part: job.part_name, serial: job.serial, verdict: verdictWord(job.inspection?.verdict) })]),
-    ...(["waiting", "running"].includes(job.state.cloud) ? [make("p", "job-remark", [icon("busy"), t("job.sign_early")])] : []),
     ...(open.length ? [make("p", "job-remark", [icon("warning"), t("job.undecided", { names: open.map((one) => one.name).join(", ") })])] : []),
     field, make("label", "job-field", [make("span", "", [t("job.note")]), note], { for: "job-sign-note" }),
     make("button", "wide primary", [icon("pen"), t("job.sign_now")], { type: "submit" }),
