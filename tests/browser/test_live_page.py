@@ -295,11 +295,15 @@ def test_labels_stay_apart(chromium: Any, server: Running) -> None:
 
 
 def check_labels(page: Any, width: int, height: int) -> int:
-    """Check that labels are inside the screen and do not overlap; returns their number."""
-    boxes = page.evaluate(
-        """[...document.querySelectorAll('#labels .label:not(.off)')].map((one) => {
-            const {left, top, right, bottom} = one.getBoundingClientRect(); return [left, top, right, bottom]; })"""
+    """Check that labels are inside the screen, and that neither labels nor signs hide a label; returns their number."""
+    boxes, signs = page.evaluate(
+        """['.label', '.sign'].map((kind) => [...document.querySelectorAll(`#labels ${kind}:not(.off)`)].map((one) => {
+            const {left, top, right, bottom} = one.getBoundingClientRect(); return [left, top, right, bottom]; }))"""
     )
+    for left, top, right, bottom in signs:
+        for box in boxes:
+            apart = max(box[0] - right, left - box[2], box[1] - bottom, top - box[3])
+            assert apart > -1.0, f"a sign hides a label by {-apart:.0f} px at {width} x {height}"
     for i, (left, top, right, bottom) in enumerate(boxes):
         assert left >= 0 and top >= 0 and right <= width and bottom <= height, (width, height)
         for other in boxes[:i]:

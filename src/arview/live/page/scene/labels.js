@@ -159,11 +159,14 @@ export class Labels {
     const placed = this.#layout.place(area, requests, this.#extent(place, requests), covered, glides);
     const anchors = new Map(requests.map((one) => [one.key, one]));
     const names = new Set(placed.map((one) => one.key));
+    const boxes = placed.map(({ key, left, top }) => grown(left, top, this.#labels.get(key)));
     const taken = []; // signs must not overlap; the more urgent one stays
     for (const [index, label] of this.#labels) {
       if (!names.has(index)) show(label, false);
-      const sign = names.has(index) ? null : signs.get(index);
-      const isOnTag = sign && !this.#isUrgent(this.all[index]) && tags.some((tag) => isInside(sign, tag));
+      let sign = names.has(index) ? null : signs.get(index);
+      // A sign must not hide the digits of a label: an urgent one is moved beside it.
+      if (sign && this.#isUrgent(this.all[index])) sign = boxes.reduce(pushedOut, sign);
+      const isOnTag = sign && !this.#isUrgent(this.all[index]) && [...tags, ...boxes].some((box) => isInside(sign, box));
       if (isOnTag || (sign && taken.some((other) => Math.hypot(other[0] - sign[0], other[1] - sign[1]) < SIGN_PX))) {
         label.sign.classList.add("off");
         continue;
@@ -338,8 +341,7 @@ export class Labels {
       taken.push({ x, y, width, height });
       tag.style.transform = `translate(${x.toFixed(1)}px, ${y.toFixed(1)}px)`;
     }
-    const reach = SIGN_PX / 2;
-    return taken.map(({ x, y, width, height }) => ({ left: x - reach, top: y - reach, right: x + width + reach, bottom: y + height + reach }));
+    return taken.map(({ x, y, ...size }) => grown(x, y, size));
   }
 
   #drawArrows(wanted, toScreen) {
@@ -369,6 +371,20 @@ function arrowPath([x0, y0], [x1, y1]) {
 function middled(name) {
   const letters = [...name], kept = Math.min(TAIL_LETTERS, letters.length >> 1);
   return make("b", "", [make("span", "", [letters.slice(0, letters.length - kept).join("")]), make("span", "", [letters.slice(letters.length - kept).join("")])]);
+}
+
+/** The box in which the middle of a sign would make it cover a label. */
+function grown(left, top, { width, height }) {
+  const reach = SIGN_PX / 2;
+  return { left: left - reach, top: top - reach, right: left + width + reach, bottom: top + height + reach };
+}
+
+/** A point moved out of a box by the shortest way. */
+function pushedOut([x, y], box) {
+  if (!isInside([x, y], box)) return [x, y];
+  const ways = [[box.left - x - 0.5, 0], [box.right - x, 0], [0, box.top - y - 0.5], [0, box.bottom - y]];
+  const [dx, dy] = ways.reduce((best, way) => (Math.hypot(...way) < Math.hypot(...best) ? way : best));
+  return [x + dx, y + dy];
 }
 
 /** The tag with mark and name of a part. */
