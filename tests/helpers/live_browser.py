@@ -144,7 +144,11 @@ def browser(film: Path | None, *more: str) -> Iterator[Any]:
 
 def screenshot(page: Any) -> Image:
     """(H,W,3) what the screen shows where the page has its picture."""
-    return np.array(PilImage.open(io.BytesIO(page.locator("#picture").screenshot())).convert("RGB"))
+    over = "document.getElementById('zoom').style.visibility"
+    page.evaluate(f"{over} = 'hidden'")  # its buttons lie over the picture
+    picture = page.locator("#picture").screenshot()
+    page.evaluate(f"{over} = ''")
+    return np.array(PilImage.open(io.BytesIO(picture)).convert("RGB"))
 
 
 def true_mask(shape: tuple[int, int], number: int) -> NDArray[np.uint8]:

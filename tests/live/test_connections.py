@@ -77,11 +77,21 @@ def https_server(folder: Path, monkeypatch: pytest.MonkeyPatch, limits: Connecti
     assert not thread.is_alive()
 
 
-def status_of(line: http.client.HTTPSConnection, server: LiveServer) -> int:
-    line.request("GET", "/api/status", headers={"Cookie": server.access.cookie.split(";")[0]})
+def status_of(line: http.client.HTTPSConnection, cookie: str) -> int:
+    line.request("GET", "/api/status", headers={"Cookie": cookie})
     answer = line.getresponse()
     answer.read()
     return answer.status
+
+
+def paired(line: http.client.HTTPSConnection, server: LiveServer) -> str:
+    """The cookie of a browser that has opened the link of the station."""
+    line.request("GET", f"/?token={server.access.token}")
+    answer = line.getresponse()
+    answer.read()
+    cookie = answer.getheader("Set-Cookie")
+    assert cookie is not None
+    return cookie.split(";")[0]
 
 
 @pytest.mark.slow
@@ -93,14 +103,15 @@ def test_idle_connections_of_one_address_stop_nobody(
         trusting = ssl.create_default_context(cadata=server.endpoint.certificates.authority_der)  # type: ignore[union-attr]
         port = server.endpoint.port
         before = http.client.HTTPSConnection(LOOPBACK, port, timeout=20, context=trusting)
-        assert status_of(before, server) == 200
+        cookie = paired(before, server)
+        assert status_of(before, cookie) == 200
         idle: list[socket.socket] = []
         for _ in range(IDLE):
             line = socket.create_connection((LOOPBACK, port), timeout=20)
             idle.append(trusting.wrap_socket(line, server_hostname=LOOPBACK) if with_handshake else line)
         began_s = time.monotonic()
         new = http.client.HTTPSConnection(LOOPBACK, port, timeout=20, context=trusting)
-        assert status_of(before, server) == 200 and status_of(new, server) == 200
+        assert status_of(before, cookie) == 200 and status_of(new, cookie) == 200
         open_lines = 0
         for line in idle:
             line.settimeout(0.01)

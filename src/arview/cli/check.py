@@ -54,5 +54,6 @@ def check(part: str, unit: str | None, camera_spec: str | None, others: tuple[st
         findings = uniqueness_findings(loaded.model, loaded.effective_view_range)
     except InputError:  # a range of views that cannot be used, which the check of the part explains
         findings = []
-    findings += [one.finding() for one in compare_parts(loaded, beside)]
+    if beside:
+        findings += [one.finding() for one in compare_parts(loaded, beside)]
     click.echo(check_part(loaded, camera).with_findings(findings).format())

@@ -193,7 +193,8 @@ def _read_metashape(path: Path) -> tuple[GivenPose, ...]:
             poses.append(GivenPose(str(camera.get("label")), _metashape_camera(sensor, path), invert(matrix)))
     except InputError:
         raise
-    except (OSError, ValueError, KeyError, TypeError, ElementTree.ParseError) as error:
+    # LookupError: the file names an encoding that does not exist.
+    except (OSError, ValueError, LookupError, TypeError, ElementTree.ParseError) as error:
         raise InputError(f"{path}: is not an XML file of cameras by Metashape ({error})") from error
     if not poses:
         raise InputError(f"{path}: holds no aligned camera")
