@@ -10,15 +10,14 @@ from __future__ import annotations
 import fcntl
 import hashlib
 import json
-import os
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import IO, Any
 
-from arview.core.atomic import replacing
+from arview.core.durable import append_durably, replace_durably, set_aside, sync_folder
 from arview.decisions.entry import FIRST, Decision, checked_name, checked_text, entry_of, line_of
 from arview.errors import InputError, OutputError
 
@@ -202,13 +201,13 @@ class DecisionLog:
                 line = line_of(made)
                 made = replace(made, sha256=_sha256(line))
                 if content.torn:
-                    self._set_aside(content.torn)
+                    set_aside(self.torn_path, content.torn)
                     data = data.removesuffix(content.torn)
                     file.truncate(len(data))
                 # A last line that is whole but for its end gets it.
-                _write_durably(file, len(data), (b"\n" if data and not data.endswith(b"\n") else b"") + line + b"\n")
+                append_durably(file, len(data), (b"\n" if data and not data.endswith(b"\n") else b"") + line + b"\n")
                 if is_new:
-                    _sync_folder(self.path.parent)
+                    sync_folder(self.path.parent)
                 self._write_end(made)
         except OSError as error:
             raise OutputError(f"{self.path}: the entry was not kept ({error.strerror or error})") from error
@@ -289,16 +288,8 @@ class DecisionLog:
         return (number, digest) if type(number) is int and number > 0 and isinstance(digest, str) else None
 
     def _write_end(self, last: Decision) -> None:
-        with replacing(self.end_path) as file:
-            file.write(json.dumps({"entry": last.number, "sha256": last.sha256}).encode() + b"\n")
-            file.flush()
-            os.fsync(file.fileno())
-
-    def _set_aside(self, torn: bytes) -> None:
-        with self.torn_path.open("ab") as file:
-            file.write(torn + b"\n")
-            file.flush()
-            os.fsync(file.fileno())
+        document = {"entry": last.number, "sha256": last.sha256}
+        replace_durably(self.end_path, json.dumps(document).encode() + b"\n")
 
     def _set_aside_before(self) -> Iterator[str]:
         if self.torn_path.exists():
@@ -313,27 +304,6 @@ def _locked(file: IO[bytes], kind: int) -> Iterator[None]:
         yield
     finally:
         fcntl.flock(file, fcntl.LOCK_UN)
-
-
-def _write_durably(file: IO[bytes], length: int, content: bytes) -> None:
-    """Write behind the first ``length`` bytes of a file; what could not be brought to the disk is taken back."""
-    try:
-        rest = memoryview(content)
-        while len(rest):
-            rest = rest[os.write(file.fileno(), rest) :]
-        os.fsync(file.fileno())
-    except OSError:
-        with suppress(OSError):
-            os.ftruncate(file.fileno(), length)
-        raise
-
-
-def _sync_folder(folder: Path) -> None:
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
 
 
 def _now() -> datetime:

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 from typing import Any
 
 from arview.cad.model import Model
-from arview.core.atomic import replacing
 from arview.core.checks import PATH, check_type
+from arview.core.durable import replace_durably
 from arview.errors import InputError, MismatchError, OutputError
 from arview.inspection.document import from_document, to_document
 from arview.inspection.record import Inspection, model_faults
@@ -58,10 +57,7 @@ def save_inspection(inspection: Inspection, path: str | Path) -> None:
     path = Path(path)
     text = json.dumps(to_document(inspection), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
     try:
-        with replacing(path) as file:
-            file.write(text.encode())
-            file.flush()
-            os.fsync(file.fileno())
+        replace_durably(path, text.encode())
     except OSError as error:
         raise OutputError(f"cannot write {path}: {error.strerror or error}") from error
 

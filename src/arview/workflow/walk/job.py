@@ -34,6 +34,7 @@ from typing import Any
 from arview.cad import Part
 from arview.cad.model import Model
 from arview.core.atomic import replacing
+from arview.core.durable import append_durably, replace_durably, set_aside, sync_folder
 from arview.errors import InputError, OutputError
 from arview.inspection import Inspection, load_inspection
 from arview.workflow.walk.records import (
@@ -234,20 +235,12 @@ class JobFolder:
         line = (json.dumps(document, ensure_ascii=False, allow_nan=False) + "\n").encode()
         try:
             if log.torn:
-                with (self.path / "photos.torn").open("ab") as aside:
-                    aside.write(log.torn + b"\n")
-                    _sync(aside.fileno())
+                set_aside(self.path / "photos.torn", log.torn)
                 os.truncate(path, log.size - len(log.torn))
             size = log.size - len(log.torn)
-            with path.open("ab") as file:
-                try:
-                    file.write(line)
-                    file.flush()
-                    _sync(file.fileno())
-                except OSError:
-                    os.truncate(path, size)  # a line that did not fit is not left behind
-                    raise
-            _sync_folder(self.path)
+            with path.open("ab", buffering=0) as file:
+                append_durably(file, size, line)
+            sync_folder(self.path)
         except OSError as error:
             raise _cannot_write(self.path, error) from error
 
@@ -448,7 +441,7 @@ def _written(folder: Path, document: dict[str, Any]) -> JobFolder:
     try:
         (folder / "photos").mkdir()
         _write_durably(folder / "job.json", (json.dumps(document, ensure_ascii=False, indent=1) + "\n").encode())
-        _sync_folder(folder.parent)
+        sync_folder(folder.parent)
     except OSError as error:
         raise _cannot_write(folder, error) from error
     return JobFolder(folder, document)
@@ -465,25 +458,9 @@ def _jobs_below(folder: Path) -> list[JobFolder]:
 
 
 def _write_durably(path: Path, content: bytes) -> None:
-    """Write a file that is complete and on the disk when this returns."""
-    with replacing(path) as file:
-        file.write(content)
-        file.flush()
-        _sync(file.fileno())
-    _sync_folder(path.parent)
-
-
-def _sync(handle: int) -> None:
-    os.fsync(handle)
-
-
-def _sync_folder(folder: Path) -> None:
-    """Put the names of a folder's files on the disk."""
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
+    """Write a file that is on the disk, with its name, when this returns."""
+    replace_durably(path, content)
+    sync_folder(path.parent)
 
 
 def _cannot_write(path: Path, error: OSError) -> OutputError:
