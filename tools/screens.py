@@ -26,7 +26,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 from arview.pose import ComponentPresence, Identity, Presence, TrackingState, Visibility
 from helpers import live_browser
 from helpers.live_client import Running
-from helpers.page import until
+from helpers.page import changed, until
 from helpers.told_session import TOLD
 from helpers.told_station import told_station
 
@@ -72,20 +72,6 @@ def answers(path: str, document: Any, status: int = 200) -> Act:
     return lambda page: page.route(f"**{path}", lambda route: route.fulfill(status=status, json=document))
 
 
-def changes(path: str, change: Callable[[dict[str, Any]], None]) -> Act:
-    """Change the documents that the station gives for a path."""
-
-    def act(page: Any) -> None:
-        def handle(route: Any) -> None:
-            document = route.fetch().json()
-            change(document)
-            route.fulfill(json=document)
-
-        page.route(f"**{path}", handle)
-
-    return act
-
-
 def script(text: str) -> Act:
     return lambda page: page.add_init_script(text)
 
@@ -110,7 +96,7 @@ def both(*acts: Act) -> Act:
 def refused(name: str) -> Act:
     """A phone whose browser refuses the camera with this error."""
     wanted = f"navigator.mediaDevices.getUserMedia = () => Promise.reject(new DOMException('', '{name}'))"
-    return both(script(wanted), changes("/api/part", lambda part: part.update(source="phone")))
+    return both(script(wanted), changed("/api/part", lambda part: part.update(source="phone")))
 
 
 def appearance(theme: str, size: str = "normal") -> Act:
@@ -124,7 +110,7 @@ def notice(code: str, level: str, text: str) -> Act:
         status.setdefault("notices", []).insert(0, {"code": code, "level": level, "text": text})
 
     return both(
-        script("localStorage; delete globalThis.RTCPeerConnection"), changes("/status", add), changes("/control", add)
+        script("localStorage; delete globalThis.RTCPeerConnection"), changed("/status", add), changed("/control", add)
     )
 
 
@@ -204,7 +190,7 @@ def shots() -> list[Shot]:
         Shot("busy", before=busy, ready=message),
         Shot("denied", before=denied, ready=message),
         Shot("no WebRTC", before=script(NO_WEBRTC), after=click("#notices .notice")),
-        Shot("future", before=changes("/api/part", in_the_future), after=click("#notices .notice")),
+        Shot("future", before=changed("/api/part", in_the_future), after=click("#notices .notice")),
         Shot("low disk", before=notice("disk_low", "warning", "1.2 GB are left for the recording: about 4 minutes")),
         Shot("frozen", after=click("#freeze")),
         Shot("parts", after=parts),

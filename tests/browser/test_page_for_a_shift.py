@@ -17,7 +17,7 @@ from PIL import Image as PilImage
 from helpers import live_browser
 from helpers.live_browser import closed, difference_mask, number_in, outline_errors_px, screenshot, true_mask
 from helpers.live_client import Running
-from helpers.page import TIMEOUT_S, WATCH, until
+from helpers.page import TIMEOUT_S, WATCH, changed, until
 from helpers.told_station import told_station
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
@@ -80,20 +80,6 @@ def opened(
         page.unroute_all(behavior="ignoreErrors")
         context.close()
     assert not errors
-
-
-def changed(path: str, change: Callable[[dict[str, Any]], Any]) -> Callable[[Any], None]:
-    """A route that changes the documents that the station gives for a path."""
-
-    def act(page: Any) -> None:
-        def handle(route: Any) -> None:
-            document = route.fetch().json()
-            change(document)
-            route.fulfill(json=document)
-
-        page.route(f"**{path}", handle)
-
-    return act
 
 
 def open_section(page: Any, name: str) -> None:

@@ -22,7 +22,7 @@ from arview.history.tables import about, decisions
 from arview.inspection import load_inspection, save_inspection
 from arview.report import make_report
 from arview.report.decisions import update_report
-from helpers.inspections import deviation, inspection
+from helpers.inspections import deviation, inspection, one_failing
 from helpers.photo_scene import bench
 
 MODEL = bench()
@@ -37,13 +37,7 @@ PART = Part(
 
 @pytest.fixture
 def job(tmp_path: Path) -> Path:
-    made = inspection(
-        MODEL,
-        (
-            deviation("block_1", (0.03, -0.02, 0.01), CENTER["block_1"]),
-            deviation("block_2", (2.4, -1.8, 0.0), CENTER["block_2"]),
-        ),
-    )
+    made = one_failing(MODEL)
     folder = tmp_path / "job"
     folder.mkdir()
     save_inspection(made, folder / "inspection.json")

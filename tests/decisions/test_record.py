@@ -23,7 +23,7 @@ from arview.errors import InputError
 from arview.inspection import Verdict, load_inspection, save_inspection
 from arview.inspection.fingerprint import fingerprint_of_file
 from arview.inspection.summary import overall_verdict
-from helpers.inspections import bench_inspection, deviation, inspection, not_measured
+from helpers.inspections import bench_inspection, deviation, inspection, not_measured, one_failing
 from helpers.photo_scene import bench
 
 MODEL = bench()
@@ -33,13 +33,7 @@ CENTER = {c.name: c.bounds_in_model.mean(axis=0) for c in MODEL.components}
 @pytest.fixture
 def job(tmp_path: Path) -> Path:
     """A job folder whose inspection has one failing and one passing component."""
-    made = inspection(
-        MODEL,
-        (
-            deviation("block_1", (0.03, -0.02, 0.01), CENTER["block_1"]),
-            deviation("block_2", (2.4, -1.8, 0.0), CENTER["block_2"]),
-        ),
-    )
+    made = one_failing(MODEL)
     save_inspection(made, tmp_path / "inspection.json")
     (tmp_path / "photos").mkdir()
     (tmp_path / "photos" / "0003.jpg").write_bytes(b"x")

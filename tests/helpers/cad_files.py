@@ -315,6 +315,18 @@ def obj_text(name: str, vertices: Array, faces: NDArray[np.int64], offset: int =
     return "\n".join(lines) + "\n"
 
 
+def write_bench(folder: Path) -> Path:
+    """``bench.obj``: a plate and a block on it, mm."""
+    text, count = "", 0
+    for name, (low, high) in {"plate": ((0, 0, 0), (90, 60, 5)), "block": ((20, 20, 5), (40, 35, 20))}.items():
+        vertices, faces = box(low, high)
+        text += obj_text(name, vertices, faces, count)
+        count += len(vertices)
+    path = folder / "bench.obj"
+    path.write_text(text)
+    return path
+
+
 # --- the same nested box in several formats ------------------------------------------------------------
 
 # parent_from_child: a quarter turn about Z, and shifts in mm; the box is 10 × 20 × 30 mm at its origin.

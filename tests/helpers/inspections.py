@@ -127,3 +127,15 @@ def bench_inspection(model: Model) -> Inspection:
         ),
         foreign=True,
     )
+
+
+def one_failing(model: Model) -> Inspection:
+    """An inspection of `photo_scene.bench` with one component in tolerance and one out of it."""
+    center = {c.name: c.bounds_in_model.mean(axis=0) for c in model.components}
+    return inspection(
+        model,
+        (
+            deviation("block_1", (0.03, -0.02, 0.01), center["block_1"]),
+            deviation("block_2", (2.4, -1.8, 0.0), center["block_2"]),
+        ),
+    )

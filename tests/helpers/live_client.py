@@ -251,6 +251,15 @@ class Phone:
         self._tasks.append(asyncio.ensure_future(watch()))
 
 
+def visiting(server: Running) -> Iterator[Http]:
+    """A page of a server; at the end its clients leave."""
+    page = server.session()
+    yield page
+    for name in list(server.hub.clients):
+        page.ask("DELETE", f"/api/clients/{name}")
+    page.close()
+
+
 def wait(condition: Callable[[], Any], timeout_s: float = 60.0) -> Any:
     """Wait until a condition is true; returns its value."""
     ends_s = time.monotonic() + timeout_s

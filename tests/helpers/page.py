@@ -55,3 +55,17 @@ window.drawn = null;
 window.draws = 0;
 document.addEventListener("arview:drawn", (event) => { window.drawn = event.detail; window.draws += 1; });
 """
+
+
+def changed(path: str, change: Callable[[dict[str, Any]], Any]) -> Callable[[Any], None]:
+    """What makes a page get changed documents from the station for a path."""
+
+    def act(page: Any) -> None:
+        def handle(route: Any) -> None:
+            document = route.fetch().json()
+            change(document)
+            route.fulfill(json=document)
+
+        page.route(f"**{path}", handle)
+
+    return act

@@ -36,15 +36,6 @@ def server() -> Iterator[Running]:
         yield server
 
 
-@pytest.fixture
-def page(server: Running) -> Iterator[Http]:
-    page = server.session()
-    yield page
-    for name in list(server.hub.clients):
-        page.ask("DELETE", f"/api/clients/{name}")
-    page.close()
-
-
 def raw(server: Running, content: bytes, timeout_s: float = 10.0) -> bytes:
     """The response of the server to raw bytes, until it closes the connection or the time is up."""
     with socket.create_connection((LOOPBACK, server.port), timeout=timeout_s) as line:

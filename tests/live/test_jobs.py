@@ -38,15 +38,6 @@ def server(folder: Path) -> Iterator[Running]:
             yield server
 
 
-@pytest.fixture
-def page(server: Running) -> Iterator[Http]:
-    page = server.session()
-    yield page
-    for name in list(server.hub.clients):
-        page.ask("DELETE", f"/api/clients/{name}")
-    page.close()
-
-
 SERIALS = iter(range(1000, 10_000))
 
 

@@ -18,7 +18,7 @@ from PIL import Image as Pillow
 
 from arview.live.stream.frames import from_jpeg, to_jpeg
 from arview.video import open_source
-from helpers.live_client import Http, Running, running, wait
+from helpers.live_client import Http, Running, running, visiting, wait
 from helpers.live_sample import (
     CAMERA,
     COUNT,
@@ -55,11 +55,7 @@ def phones(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
 
 @pytest.fixture
 def page(phones: Running) -> Iterator[Http]:
-    page = phones.session()
-    yield page
-    for name in list(phones.hub.clients):
-        page.ask("DELETE", f"/api/clients/{name}")
-    page.close()
+    yield from visiting(phones)
 
 
 @pytest.mark.slow

@@ -25,7 +25,7 @@ from arview.reconstruction.intake import Intake
 from arview.reconstruction.run import Reconstruction
 from arview.workflow.lock import exclusive_access
 from arview.workflow.progress import STEPS, ProgressEstimate, ProgressEstimator, time_text
-from helpers.cad_files import box
+from helpers.cad_files import write_bench
 from helpers.inspections import deviation, inspection, not_measured
 from helpers.video_files import numbered, write_clip
 
@@ -40,13 +40,7 @@ class Bench:
         self.moved: tuple[float | None, ...] = (0.1, 0.0, 0.0)
         self.is_measured, self.is_foreign = True, False
         self.fails: dict[str, BaseException] = {}
-        lines, start = [], 1
-        for name, (low, high) in {"plate": ((0, 0, 0), (90, 60, 5)), "block": ((20, 20, 5), (40, 35, 20))}.items():
-            vertices, faces = box(low, high)
-            lines += [f"o {name}", *("v {} {} {}".format(*v) for v in vertices)]
-            lines += ["f {} {} {}".format(*(face + start)) for face in faces]
-            start += len(vertices)
-        (folder / "bench.obj").write_text("\n".join(lines))
+        write_bench(folder)
         (folder / "part.toml").write_text(PART)
         (folder / "photos").mkdir()
         for i in range(4):

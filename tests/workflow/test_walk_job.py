@@ -19,7 +19,7 @@ from arview.errors import InputError, OutputError
 from arview.inspection import save_inspection
 from arview.workflow.walk.job import JobFolder, find_job, jobs_in
 from arview.workflow.walk.records import WalkState
-from helpers.cad_files import box
+from helpers.cad_files import write_bench
 from helpers.inspections import deviation, inspection
 
 PART = '[part]\nname = "bench 4/2"\ncad = "bench.obj"\nunit = "mm"\n[components.plate]\nrole = "base"\n'
@@ -28,13 +28,7 @@ POSE = np.eye(4).ravel().tolist()
 
 @pytest.fixture
 def part(tmp_path: Path) -> Part:
-    lines, start = [], 1
-    for name, (low, high) in {"plate": ((0, 0, 0), (90, 60, 5)), "block": ((20, 20, 5), (40, 35, 20))}.items():
-        vertices, faces = box(low, high)
-        lines += [f"o {name}", *("v {} {} {}".format(*v) for v in vertices)]
-        lines += ["f {} {} {}".format(*(face + start)) for face in faces]
-        start += len(vertices)
-    (tmp_path / "bench.obj").write_text("\n".join(lines))
+    write_bench(tmp_path)
     (tmp_path / "part.toml").write_text(PART)
     return load_part(tmp_path / "part.toml")
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import zoneinfo
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from datetime import UTC, datetime, tzinfo
 from typing import TYPE_CHECKING
 
@@ -45,6 +45,13 @@ def _parse_zone(ctx: click.Context, parameter: click.Parameter, value: str) -> t
 
 ZONE = click.option("--zone", metavar="ZONE", default="UTC", show_default=True, callback=_parse_zone,
                     help="Time zone of the dates, such as Europe/Berlin.")  # fmt: skip
+
+
+def _with_filters(command: Callable[..., None]) -> Callable[..., None]:
+    """The options of a command that writes chosen results."""
+    for option in (STORE, SINCE, STATION, SERIAL, PART, ZONE):
+        command = option(command)
+    return command
 
 
 @main.group(
@@ -327,12 +334,7 @@ Examples:
 \b
 .csv has a line for each component of each result; .jsonl has one whole inspection per line.""")  # fmt: skip
 @click.option("-o", "--output", required=True, metavar="FILE", help="File to write: .csv or .jsonl.")
-@ZONE
-@PART
-@SERIAL
-@STATION
-@SINCE
-@STORE
+@_with_filters
 def export(
     output: str, zone: tzinfo, part: str | None, serial: str | None, station: str | None, since: str | None,
     store: str | None,
@@ -383,12 +385,7 @@ Examples:
 `arview history add` copies them from the decisions.jsonl beside an inspection.""",
 )
 @click.option("-o", "--output", metavar="FILE", help="Write them as CSV.")
-@ZONE
-@PART
-@SERIAL
-@STATION
-@SINCE
-@STORE
+@_with_filters
 def list_decisions(
     output: str | None, zone: tzinfo, part: str | None, serial: str | None, station: str | None, since: str | None,
     store: str | None,

@@ -19,7 +19,7 @@ from arview.live.security.refusals import Refusal
 from arview.live.server.hub import Hub
 from arview.live.stream.documents import Document
 
-SNAPSHOT = re.compile(r"snapshot_[\w.-]+\.png")
+KEPT_NAME = re.compile(r"snapshot_[\w.-]+\.png")
 """Names of the snapshots that are kept, and served."""
 MAX_SNAPSHOTS = 2000
 """Snapshots that are listed, and beyond which no more are kept."""
@@ -73,13 +73,13 @@ class StationHandlers:
 
     async def snapshots(self, request: Request) -> Response:
         """The snapshots that are kept."""
-        return JSONResponse({"snapshots": await asyncio.to_thread(_snapshots, self._folder)})
+        return JSONResponse({"snapshots": await asyncio.to_thread(_kept_pictures, self._folder)})
 
     async def snapshot(self, request: Request) -> Response:
         """A snapshot that is kept."""
         name = request.path_params["name"]
         path = self._folder / name
-        if SNAPSHOT.fullmatch(name) is None or not path.is_file():
+        if KEPT_NAME.fullmatch(name) is None or not path.is_file():
             raise Refusal(404, "not_found", "there is no such snapshot")
         return FileResponse(path, media_type="image/png")
 
@@ -129,7 +129,7 @@ def keep_snapshot(folder: Path, part_name: str, png: bytes) -> str:
     return name
 
 
-def _snapshots(folder: Path) -> list[Document]:
+def _kept_pictures(folder: Path) -> list[Document]:
     """Name, size and time of each snapshot, the newest first."""
     found = []
     for path in folder.glob("snapshot_*.png"):
