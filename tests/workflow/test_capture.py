@@ -185,7 +185,7 @@ def test_a_full_disk_ends_it_and_keeps_the_photos_before(tmp_path: Path, monkeyp
         written.append(path)
         return replacing(path)
 
-    monkeypatch.setattr("arview.workflow.walk.job.replacing", full)
+    monkeypatch.setattr("arview.core.durable.replacing", full)
     with pytest.raises(OutputError, match="out"):
         capture_photos(walk, Known(walk.poses), PART, lambda index: CAMERA, job)
     assert len(job.photos()) == 3

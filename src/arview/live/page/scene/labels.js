@@ -17,7 +17,7 @@ const TAIL_LETTERS = 6; // end of a name that is never cut
 const EDGE_PX = 22; // distance of the tail of an arrow at the border of the picture
 const OUTSIDE = 1.3; // distance from the middle, relative to the border, of a point that stands for one behind the camera
 const SVG = "http://www.w3.org/2000/svg";
-const STUB_PX = 10, SIGN_PX = 24, ARROW_HEAD_PX = 11;
+const STUB_PX = 10, SIGN_PX = 26, ARROW_HEAD_PX = 11, FAR_PX = 1e6;
 
 export class Labels {
   #layout = new LabelLayout();
@@ -165,7 +165,7 @@ export class Labels {
       if (!names.has(index)) show(label, false);
       let sign = names.has(index) ? null : signs.get(index);
       // A sign must not hide the digits of a label: an urgent one is moved beside it.
-      if (sign && this.#isUrgent(this.all[index])) sign = boxes.reduce(pushedOut, sign);
+      if (sign && this.#isUrgent(this.all[index])) sign = pushedOut(sign, boxes);
       const isOnTag = sign && !this.#isUrgent(this.all[index]) && [...tags, ...boxes].some((box) => isInside(sign, box));
       if (isOnTag || (sign && taken.some((other) => Math.hypot(other[0] - sign[0], other[1] - sign[1]) < SIGN_PX))) {
         label.sign.classList.add("off");
@@ -379,12 +379,15 @@ function grown(left, top, { width, height }) {
   return { left: left - reach, top: top - reach, right: left + width + reach, bottom: top + height + reach };
 }
 
-/** A point moved out of a box by the shortest way. */
-function pushedOut([x, y], box) {
-  if (!isInside([x, y], box)) return [x, y];
-  const ways = [[box.left - x - 0.5, 0], [box.right - x, 0], [0, box.top - y - 0.5], [0, box.bottom - y]];
-  const [dx, dy] = ways.reduce((best, way) => (Math.hypot(...way) < Math.hypot(...best) ? way : best));
-  return [x + dx, y + dy];
+/** The nearest point that is in none of the boxes; one out of a box may be in the next, so that every way out is tried. */
+function pushedOut(point, boxes, depth = 3) {
+  const box = boxes.find((one) => isInside(point, one));
+  if (!box || depth === 0) return point;
+  const [x, y] = point;
+  const ways = [[box.left - 0.5, y], [box.right + 0.5, y], [x, box.top - 0.5], [x, box.bottom + 0.5]];
+  const isFree = (one) => !boxes.some((other) => isInside(one, other));
+  const far = (one) => Math.hypot(one[0] - x, one[1] - y) + (isFree(one) ? 0 : FAR_PX);
+  return ways.map((way) => pushedOut(way, boxes, depth - 1)).reduce((best, one) => (far(one) < far(best) ? one : best));
 }
 
 /** The tag with mark and name of a part. */
