@@ -142,6 +142,17 @@ def files() -> Act:
     )  # fmt: skip
 
 
+def devices() -> Act:
+    now = datetime.now(UTC)
+
+    def device(name: str, days: float, is_this: bool = False) -> dict[str, Any]:
+        used = (now - timedelta(days=days)).isoformat().replace("+00:00", "Z")
+        return {"name": name, "created": "2026-11-02T08:12:00Z", "last_used": used, "is_this": is_this}
+
+    listed = [device("Android Chrome", 0, True), device("iPad Safari", 0.1), device("Windows Firefox 2", 12)]
+    return answers("/api/devices", {"devices": listed})
+
+
 def in_the_future(part: dict[str, Any]) -> None:
     made = datetime.now(UTC) + timedelta(days=2)
     part["inspection"] |= {"created": made.isoformat().replace("+00:00", "Z"), "age_s": -172_800}
@@ -175,6 +186,9 @@ def shots() -> list[Shot]:
     card = both(parts, click('.components button[data-name="nut_1"]'), click("#close-side"))
     video = both(click("#transports input[value=video]"), lambda page: page.wait_for_timeout(6000))
     open_files = both(parts, click('[data-tab="files"]'))
+    open_devices = both(parts, click('[data-tab="devices"]'))
+    revoke = both(open_devices, lambda page: page.wait_for_timeout(500), click(".devices li:nth-child(2) button"))
+    to_devices = evaluate("document.querySelector('#devices').scrollIntoView()")
     return [
         Shot("loading", before=answers("/api/part", loading), ready=message),
         Shot("searching", told=searching, ready=state.format("searching")),
@@ -196,6 +210,12 @@ def shots() -> list[Shot]:
         Shot("parts", after=parts),
         Shot("view", after=view),
         Shot("files", before=files(), after=open_files),
+        *(Shot(f"devices, {name}", size=shape, before=devices(), after=both(open_devices, to_devices), settings=one)
+          for name, shape, one in (
+              ("phone", PHONE, {}), ("small", SMALL, german), ("landscape", LANDSCAPE, {}), ("desk", DESK, german),
+          )),
+        Shot("devices, revoke", before=devices(), after=revoke),
+        Shot("devices, revoke, landscape", size=LANDSCAPE, before=devices(), after=revoke, settings=german),
         Shot("card", after=card),
         Shot("serial", after=evaluate(SERIAL)),
         Shot("job", after=click("#open-job")),

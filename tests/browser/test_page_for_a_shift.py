@@ -110,7 +110,7 @@ def test_every_control_has_a_name_and_german_is_complete(chromium: Any, station:
             until(page, LOADED)
             found = names[locale[:2]] = {"picture": {name for _, name in controls(page)}}
             assert page.evaluate("document.documentElement.lang") == locale[:2]
-            for section in ("job", "parts", "view", "files"):
+            for section in ("job", "parts", "view", "files", "devices"):
                 open_section(page, section)
                 page.wait_for_timeout(400)
                 assert all(name for _, name in controls(page)), (locale, section, controls(page))
@@ -124,7 +124,7 @@ def test_every_control_has_a_name_and_german_is_complete(chromium: Any, station:
                 assert all(name for _, name in controls(page, least=3))
     assert {"Freeze", "Snapshot", "Zoom in"} <= names["en"]["picture"]
     assert {"Anhalten", "Foto", "Vergrößern"} <= names["de"]["picture"]
-    for section in ("picture", "view", "files"):
+    for section in ("picture", "view", "files", "devices"):
         words = {name for name in names["en"][section] if re.search(r"[a-z]{3}", name)}
         same = {one for one in words & names["de"][section] if "_" not in one}  # names of components
         assert len(same) <= 0.2 * len(words), (section, same)
@@ -330,6 +330,42 @@ def test_files_are_listed_opened_and_shared(chromium: Any, station: Running) -> 
         until(page, LOADED)
         open_section(page, "files")
         until(page, "document.querySelectorAll('.files li').length === 3")
+
+
+def test_paired_devices_are_listed_and_revoked(chromium: Any, station: Running) -> None:
+    with opened(chromium, station, viewport=PHONE) as lent, opened(chromium, station, viewport=PHONE) as page:
+        until(lent, LOADED)
+        until(page, LOADED)
+        own = page.evaluate(
+            "fetch('/api/devices').then((one) => one.json()).then((one) => one.devices.find((each) => each.is_this).name)"
+        )
+        other = lent.evaluate(
+            "fetch('/api/devices').then((one) => one.json()).then((one) => one.devices.find((each) => each.is_this).name)"
+        )
+        assert own != other
+        open_section(page, "devices")
+        until(page, "document.querySelectorAll('.devices li').length >= 2")
+        assert page.locator(".devices li[aria-current=true] .name").all_inner_texts() == [own]
+        assert "this device" in page.inner_text(".devices li[aria-current=true]")
+        assert "last seen just now" in page.inner_text(f".devices li:has([aria-label='Revoke {other}'])")
+        revoke = page.get_by_role("button", name=f"Revoke {other}", exact=True)
+        for refuse in (lambda: page.keyboard.press("Enter"), lambda: page.keyboard.press("Escape")):
+            revoke.click()
+            dialog = page.get_by_role("alertdialog", name=f"Revoke {other}?")
+            assert dialog.is_visible()
+            refuse()  # "Keep it" has the focus
+            until(page, "document.querySelector('dialog') === null")
+            assert lent.evaluate("fetch('/api/devices').then((one) => one.status)") == 200
+        revoke.click()
+        page.get_by_role("button", name="Yes, revoke it").click()
+        until(page, f"document.querySelector('#toast').textContent === '{other} is no longer paired'")
+        until(page, f"![...document.querySelectorAll('.devices .name')].some((one) => one.textContent === '{other}')")
+        assert lent.evaluate("fetch('/api/devices').then((one) => one.status)") == 403
+        until(lent, "document.querySelector('#message').textContent.includes('no longer valid')")
+        page.get_by_role("button", name=f"Revoke {own}", exact=True).click()
+        assert "the device that you are using" in page.inner_text("dialog")
+        page.get_by_role("button", name="Yes, revoke it").click()
+        until(page, "document.querySelector('#message').textContent.includes('no longer valid')")
 
 
 def test_a_serial_number_is_typed_scanned_or_taken_over(chromium: Any, station: Running) -> None:

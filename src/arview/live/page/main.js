@@ -4,6 +4,7 @@ import { Camera, quarterTurns } from "./camera.js";
 import { CameraControls } from "./settings/camera_controls.js";
 import { Connection } from "./transport/connection.js";
 import { connectKeys } from "./keys.js";
+import { Devices } from "./lists/devices.js";
 import { Files } from "./lists/files.js";
 import { allNotices, blocking, retryText } from "./faults.js";
 import { askSerial } from "./serial.js";
@@ -54,10 +55,16 @@ const stage = new Stage({
 });
 const zoom = new ZoomControls(find("zoom"), stage);
 const files = new Files(find("file-lists"), (text) => toast.show(text));
+const devices = new Devices(find("device-list"), (text) => toast.show(text));
 const sheet = new Sheet(find("side"), (section) => {
   if (section === "files") files.refresh();
+  if (section === "devices") devices.refresh();
   stage.measure();
 });
+// On a large screen all sections stand beside the picture: lists are asked for when they come into view.
+for (const [id, lists] of [["files", files], ["devices", devices]]) {
+  new IntersectionObserver((seen) => { if (!sheet.open && seen.at(-1).isIntersecting) lists.refresh(); }).observe(find(id));
+}
 const camera = new Camera(find("camera"), takeCameraFrame, (trouble) => {
   state.trouble = trouble;
   refresh();
