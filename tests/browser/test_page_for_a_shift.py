@@ -27,6 +27,8 @@ PHONE = {"width": 390, "height": 844}
 ROOMY = {"width": 680, "height": 640}
 LOADED = "document.querySelector('.components button') !== null"
 TRACKED = "window.drawn?.pose?.state === 'tracked'"
+OWN_NAME = """
+fetch('/api/devices').then((one) => one.json()).then((one) => one.devices.find((each) => each.is_this).name)"""
 NO_WEBRTC = "delete globalThis.RTCPeerConnection"
 NAMED_ROLES = {"button", "switch", "radio", "slider", "combobox", "textbox", "link", "progressbar", "meter", "checkbox"}
 RATIO = """
@@ -336,12 +338,8 @@ def test_paired_devices_are_listed_and_revoked(chromium: Any, station: Running) 
     with opened(chromium, station, viewport=PHONE) as lent, opened(chromium, station, viewport=PHONE) as page:
         until(lent, LOADED)
         until(page, LOADED)
-        own = page.evaluate(
-            "fetch('/api/devices').then((one) => one.json()).then((one) => one.devices.find((each) => each.is_this).name)"
-        )
-        other = lent.evaluate(
-            "fetch('/api/devices').then((one) => one.json()).then((one) => one.devices.find((each) => each.is_this).name)"
-        )
+        own = page.evaluate(OWN_NAME)
+        other = lent.evaluate(OWN_NAME)
         assert own != other
         open_section(page, "devices")
         until(page, "document.querySelectorAll('.devices li').length >= 2")
