@@ -11,6 +11,7 @@ import re
 import subprocess
 import tempfile
 import time
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -23,11 +24,13 @@ from arview.evaluation import Scene, evaluate_scene, scene_guide_views
 from arview.guideviews import GuideViewOptions, load_guide_views, make_guide_views
 from arview.tracking import SessionOptions
 from recordings import SAMPLE, sample_command, scenes, skip, table
+from suites.cloud_cost import cloud_costs
 from suites.lenses import lens_errors
 from suites.live_latency import live_latencies
 from suites.registration import MEASURED, REFERENCE, registrations
 
 TableRow = tuple[str, str, str]
+CLOUD_POINTS = (1_000_000, 20_000_000)
 MODALITIES = {"region+edge": SessionOptions(use_texture=False), "all three": SessionOptions()}
 DETECTED_FRAMES = 12
 
@@ -37,17 +40,18 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="write the figures to this file too")
     parser.add_argument(
         "--only",
-        choices=["guideviews", "track", "detect", "annotate", "register", "lenses", "live"],
+        choices=["guideviews", "track", "detect", "annotate", "register", "clouds", "lenses", "live"],
         help="only this section",
     )
     chosen = parser.parse_args()
-    found: dict[str, Scene] = {} if chosen.only in ("register", "lenses") else scenes()
+    found: dict[str, Scene] = {} if chosen.only in ("register", "clouds", "lenses") else scenes()
     sections = {
         "guideviews": lambda: bench_guide_views(found),
         "track": lambda: bench_tracking(found),
         "detect": lambda: bench_detection(found),
         "annotate": bench_annotate,
         "register": bench_registration,
+        "clouds": bench_clouds,
         "lenses": bench_lenses,
         "live": bench_live,
     }
@@ -150,6 +154,21 @@ def bench_annotate() -> tuple[dict[str, Any], list[TableRow]]:
                 raise SystemExit(f"annotate printed no frame rate: {text}")
             figures[label] = {"fps": float(match[1]), "peak_mb": peak_mb}
             rows.append((f"annotate, {label}", SAMPLE.name, f"{match[1]} fps, peak memory {peak_mb:.0f} MB"))
+    return figures, rows
+
+
+def bench_clouds() -> tuple[dict[str, Any], list[TableRow]]:
+    """CPU time, peak memory and errors of `arview measure --cloud`, by number of points and format."""
+    figures: dict[str, Any] = {}
+    rows: list[TableRow] = []
+    with tempfile.TemporaryDirectory() as folder:
+        for one in cloud_costs(Path(folder), CLOUD_POINTS):
+            figures[f"{one.kind}, {one.points}"] = asdict(one)
+            figure = (
+                f"{one.cpu_s:.0f} CPU-s, peak memory {one.peak_mb:.0f} MB; {one.within} of {one.measured} within U, at"
+                f" most {1000 * one.worst_mm:.1f} um off, mean U {one.mean_u_mm:.3f} mm"
+            )
+            rows.append(("measure --cloud", f"sample plate, {one.points:,} points, {one.kind.upper()}", figure))
     return figures, rows
 
 

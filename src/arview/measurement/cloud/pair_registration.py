@@ -280,8 +280,8 @@ def _near_lists(
     """(N,J) for each scene point, points within 0.6 diameters in random order, rare ones preferred; -1 at the end."""
     lists = np.full((len(scene.points), 4 * o.scored), -1, dtype=np.int64)
     tree = cKDTree(scene.points)
-    for i, near in enumerate(tree.query_ball_point(scene.points, 0.6 * diameter_mm)):
-        near = np.array(near)
+    for i, point in enumerate(scene.points):  # one at a time: the lists of all together would fill a gigabyte
+        near = np.array(tree.query_ball_point(point, 0.6 * diameter_mm))
         # Weighted choice without repetition (Efraimidis & Spirakis 2006).
         order = np.argsort(-(rng.random(len(near)) ** (1.0 / scene.weights[near])))[: lists.shape[1]]
         lists[i, : len(order)] = rng.permutation(near[order])
