@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import csv
 import io
+from dataclasses import replace
+from datetime import timedelta
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -21,7 +24,7 @@ from arview.decisions import (
 from arview.decisions.folder import photo_path
 from arview.errors import InputError
 from arview.inspection import Verdict, load_inspection, save_inspection
-from arview.inspection.fingerprint import fingerprint_of_file
+from arview.inspection.fingerprint import component_fingerprint, fingerprint_of_file, values_fingerprint
 from arview.inspection.summary import overall_verdict
 from helpers.inspections import bench_inspection, deviation, inspection, not_measured, one_failing
 from helpers.photo_scene import bench
@@ -88,8 +91,69 @@ def test_another_inspection_voids_the_signature(job: Path) -> None:
     save_inspection(other, job / "inspection.json")
     state = state_of_record(job)
     assert not state.is_released
-    assert "the inspection is another than the one that was signed" in state.sentence
+    assert "it was made about earlier values" in state.sentence
     assert [one.component for one in state.earlier] == ["block_2"]
+
+
+def _written_again(job: Path, **changes: Any) -> None:
+    """The record as the cloud and the comparison of halves write it again after the verdict."""
+    path = job / "inspection.json"
+    made = load_inspection(path)
+    provenance = replace(made.provenance, method="sweep, edges, cloud in 24 photos", cpu_s=31.0)
+    later = replace(made, created=made.created + timedelta(minutes=2), provenance=provenance, warnings=("a remark",))
+    save_inspection(replace(later, **changes), path)
+
+
+def test_decisions_and_signature_at_the_verdict_hold_when_the_cloud_changes_no_value(job: Path) -> None:
+    decide_component(job, "block_2", True, "agreed", by="Ada")
+    sign_inspection(job, "Grace")
+    before = fingerprint_of_file(job / "inspection.json")
+    _written_again(job)
+    assert fingerprint_of_file(job / "inspection.json") != before
+    state = state_of_record(job)
+    assert state.is_released and not state.earlier
+
+
+def test_a_value_that_the_cloud_changes_is_told_where_it_changed(job: Path) -> None:
+    """The other component's decision stays, since nothing of it changed; the signature was about both."""
+    decide_component(job, "block_1", True, "", by="Ada")
+    decide_component(job, "block_2", True, "agreed", by="Ada")
+    sign_inspection(job, "Grace")
+    made = load_inspection(job / "inspection.json")
+    moved = deviation("block_2", (2.3, -1.8, 0.0), CENTER["block_2"])
+    _written_again(job, components=tuple(moved if one.name == "block_2" else one for one in made.components))
+    state = state_of_record(job)
+    assert [one.component for one in state.earlier] == ["block_2"] and state.undecided == ("block_2",)
+    assert state.signature is not None and "earlier values" in state.signature.void and not state.is_released
+
+
+def test_a_foreign_object_that_the_cloud_finds_voids_the_signature(job: Path) -> None:
+    decide_component(job, "block_2", True, "agreed", by="Ada")
+    sign_inspection(job, "Grace")
+    _written_again(job, foreign_objects=bench_inspection(MODEL).foreign_objects)
+    state = state_of_record(job)
+    assert state.signature is not None and state.signature.void and not state.earlier
+
+
+def test_a_log_that_names_the_file_is_still_read(job: Path) -> None:
+    """Older logs hold the fingerprint of the file: they hold as long as the file is that one."""
+    file = fingerprint_of_file(job / "inspection.json")
+    log_of(job).decide("block_2", True, "agreed", by="Ada", inspection_sha256=file)
+    log_of(job).sign("Grace", inspection_sha256=file)
+    assert state_of_record(job).is_released
+    _written_again(job)
+    state = state_of_record(job)
+    assert not state.is_released and [one.component for one in state.earlier] == ["block_2"]
+
+
+def test_the_fingerprint_is_of_values_to_a_tenth_of_a_micrometre(job: Path) -> None:
+    made = load_inspection(job / "inspection.json")
+    hashes = set()
+    for step in (0.0, 1e-9, 0.002):
+        x, y, z = 2.1 + step, -1.8, 0.0
+        one = deviation("block_2", (x, y, z), CENTER["block_2"])
+        hashes.add(values_fingerprint(replace(made, components=(*made.components[:1], one))))
+    assert len(hashes) == 2
 
 
 def test_another_formatting_does_not(job: Path) -> None:
@@ -212,8 +276,10 @@ def test_a_check_that_fails_is_decided_about_anew(job: Path) -> None:
     sign_inspection(job, "Grace")
     state = state_of_record(job)
     assert state.is_released and "1 deviation accepted (block_2: as good as it gets)" in state.sentence
-    newest = fingerprint_of_file(job / "recheck" / "02" / "inspection.json")
-    assert log_of(job).latest()["block_2"].inspection_sha256 == newest
+    newest = load_inspection(job / "recheck" / "02" / "inspection.json").find("block_2")
+    assert newest is not None
+    about = log_of(job).latest()["block_2"].inspection_sha256
+    assert about == component_fingerprint(load_inspection(job / "inspection.json"), newest)
 
 
 def test_a_check_has_the_record_of_the_first_measurement(job: Path) -> None:

@@ -285,14 +285,19 @@ class Inspector:
         return self.measure("last photo to the verdict of the check again")
 
     def sign(self, by: str) -> None:
-        """Sign the result, when cloud and report are there: a signature before would not hold."""
+        """Sign the result, when cloud and report are there: one before would be void if the cloud changed a value."""
         begun_s = time.monotonic()
-        self.until(lambda: self.page.locator("#job .job-ends .primary:enabled").count(), "the cloud and the report")
+        self.until(self._has_cloud, "the cloud and the report")
         self.timed("until cloud and report are there", begun_s)
         self.page.locator("#job .job-ends .primary").click()
         self.page.fill("#job-sign-by", by)
         self.page.locator("#job .job-form .primary").click()
         self.until(lambda: "Signed by" in self.page.inner_text("#job"), "the signature")
+
+    def _has_cloud(self) -> bool:
+        """Whether the result is shown, without the remark that the cloud is still made."""
+        ready = self.page.locator("#job .job-ends .primary:enabled").count()
+        return bool(ready) and "point cloud is still being made" not in self.page.inner_text("#job")
 
     def report(self, by: str) -> str:
         """The report of the job; waits until the signature is in it."""

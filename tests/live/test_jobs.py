@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 
+from arview.inspection import load_inspection, save_inspection
 from arview.live.jobs import workers
 from arview.live.stream.frames import to_jpeg
 from arview.workflow.walk.job import JobFolder, find_job
@@ -317,14 +318,17 @@ def test_a_recheck_shows_the_new_number_beside_the_others(page: Http, folder: Pa
     assert page.ask("GET", f"/api/jobs/{first}/photos/recheck/01/0002.jpg")[0] == 404
 
 
-def test_nobody_signs_what_is_written_again(page: Http, server: Running, folder: Path) -> None:
+def test_a_signature_at_the_verdict_holds_while_the_cloud_is_made(page: Http, server: Running, folder: Path) -> None:
     job = started(page)
     measured(on_disk(folder, job))
     on_disk(folder, job).write_state(replace(on_disk(folder, job).state(), cloud="running"))
     server.hub.desk.workers.ask(on_disk(folder, job))
-    assert page.json("POST", f"/api/jobs/{job}/sign", {"by": "Ada"})[0] == 409
-    on_disk(folder, job).write_state(replace(on_disk(folder, job).state(), cloud="failed"))
     assert page.json("POST", f"/api/jobs/{job}/sign", {"by": "Ada"})[0] == 201
+    assert page.json("GET", f"/api/jobs/{job}")[1]["signed"]["by"] == "Ada"
+    path = on_disk(folder, job).path / "inspection.json"
+    made = load_inspection(path)
+    save_inspection(replace(made, warnings=(*made.warnings, "a remark of the cloud")), path)
+    assert page.json("GET", f"/api/jobs/{job}")[1]["signed"]["by"] == "Ada"
 
 
 def test_a_failed_measurement_is_told(page: Http, folder: Path) -> None:

@@ -43,7 +43,8 @@ class Decision:
         photo: of a decision: name of a photo that shows it.
         step: of a tick: index of the step of the rework.
         is_done: of a tick.
-        inspection_sha256: fingerprint of the inspection that was signed or decided about; empty if unknown.
+        inspection_sha256: fingerprint of the values that were signed (`values_fingerprint`) or decided about
+            (`component_fingerprint`); in older logs of the inspection's file; empty if unknown.
         rechecks: of a signature: fingerprints of the checks of reworked components that it holds for, in their order.
         previous: SHA-256 of the line before it.
         sha256: SHA-256 of its own line.

@@ -14,7 +14,7 @@ from arview.decisions.log import DecisionLog
 from arview.decisions.record import Recheck, RecordState, record_state
 from arview.errors import InputError
 from arview.inspection import ComponentDeviation, Inspection, Verdict, load_inspection
-from arview.inspection.fingerprint import fingerprint_of_file
+from arview.inspection.fingerprint import component_fingerprint, fingerprint_of_file, values_fingerprint
 
 _FILE = "decisions.jsonl"
 _INSPECTION = "inspection.json"
@@ -71,7 +71,8 @@ def rechecks_of(target: str | Path) -> list[tuple[Path, Recheck]]:
             for one in inspection.components
             if (one.name in names if names is not None else one.verdict is not Verdict.NOT_MEASURED)
         )
-        found.append((path, Recheck(fingerprint_of_file(path), inspection.created, components)))
+        photos = inspection.provenance.photos_hash
+        found.append((path, Recheck(fingerprint_of_file(path), inspection.created, components, photos)))
     return found
 
 
@@ -120,20 +121,21 @@ def decide_component(
     if entry is None:
         known = ", ".join(one.name for one in inspection.components)
         raise InputError(f"{path}: the inspection has no component {name!r}; it has: {known}")
-    measured, newest = _newest(path, entry)
+    newest, photos_hash = _newest(path, entry)
     has_passed = newest.verdict in (Verdict.PASS, Verdict.MEASURED)
     text = checked_text(reason, "reason", required=not (is_ok and has_passed))
     kept = None if photo is None else _kept_photo(inspection_path(target), path, photo)
-    return log_of(path).decide(name, is_ok, text, note, by, kept, fingerprint_of_file(measured))
+    sha256 = component_fingerprint(inspection, newest, photos_hash)
+    return log_of(path).decide(name, is_ok, text, note, by, kept, sha256)
 
 
-def _newest(path: Path, entry: ComponentDeviation) -> tuple[Path, ComponentDeviation]:
-    """The newest measurement of a component, and the file of its inspection."""
-    for file, check in reversed(rechecks_of(path)):
+def _newest(path: Path, entry: ComponentDeviation) -> tuple[ComponentDeviation, str | None]:
+    """The newest measurement of a component, and the hash of its photos; None for those of the first one."""
+    for _, check in reversed(rechecks_of(path)):
         for one in check.components:
             if one.name == entry.name:
-                return file, one
-    return path, entry
+                return one, check.photos_hash
+    return entry, None
 
 
 def tick_step(target: str | Path, component: str, step: int, is_done: bool, by: str) -> Decision:
@@ -153,13 +155,15 @@ def tick_step(target: str | Path, component: str, step: int, is_done: bool, by: 
 def sign_inspection(target: str | Path, by: str, note: str = "") -> Decision:
     """Sign the inspection of a folder or file as it is now, with the checks of reworked components that belong to it.
 
+    It is about the values and verdicts: it holds while they stay the same, whatever else is written of them.
+
     Raises:
         InputError: there is no inspection, or as `DecisionLog.sign`.
         OutputError: the log cannot be written.
     """
-    path, _ = _read(target)
+    path, inspection = _read(target)
     rechecks = [check.sha256 for _, check in rechecks_of(path)]
-    return log_of(path).sign(by, note, fingerprint_of_file(path), rechecks)
+    return log_of(path).sign(by, note, values_fingerprint(inspection), rechecks)
 
 
 def photo_path(target: str | Path, photo: str) -> Path | None:

@@ -107,7 +107,7 @@ class DecisionLog:
         Args:
             by: who signs.
             note: free text.
-            inspection_sha256: fingerprint of the inspection that is signed, see `fingerprint_of_file`.
+            inspection_sha256: fingerprint of the values that are signed, see `values_fingerprint`.
             rechecks: those of the checks of reworked components that belong to it, in their order.
 
         Raises:
@@ -144,10 +144,10 @@ class DecisionLog:
         return found
 
     def signature(self, inspection_sha256: str | None = None) -> Decision | None:
-        """The last signature if it holds: no decision follows it, and it is of the inspection of this fingerprint.
+        """The last signature if it holds: no decision follows it, and it is of the values of this fingerprint.
 
         Args:
-            inspection_sha256: fingerprint of the inspection as it is now; None leaves that unchecked.
+            inspection_sha256: fingerprint of the values as they are now; None leaves that unchecked.
         """
         content = self.content()
         last = None

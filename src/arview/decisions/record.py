@@ -10,6 +10,7 @@ from typing import Any
 from arview.decisions.entry import Decision, decision_document, stamp
 from arview.decisions.log import LogContent
 from arview.inspection import ComponentDeviation, Finding, Inspection, Verdict
+from arview.inspection.fingerprint import component_fingerprint, values_fingerprint
 
 _OPEN_WORDS = {
     Verdict.FAIL: "is out of tolerance",
@@ -39,11 +40,13 @@ class Recheck:
         sha256: fingerprint of the inspection that holds them.
         created: time of the measurement, UTC.
         components: those that were checked.
+        photos_hash: of its photos.
     """
 
     sha256: str
     created: datetime
     components: tuple[ComponentDeviation, ...]
+    photos_hash: str = ""
 
 
 @dataclass(frozen=True)
@@ -91,30 +94,34 @@ def record_state(
 
     Args:
         inspection: the inspection.
-        sha256: its fingerprint, see `fingerprint_of_file`.
+        sha256: fingerprint of its file, see `fingerprint_of_file`, which older logs name.
         content: of the log.
         rechecks: checks of reworked components, in their order.
     """
     newest = {one.name: one for one in inspection.components}
     measured = dict.fromkeys(newest, 0)
+    values = {name: component_fingerprint(inspection, one) for name, one in newest.items()}
     created = dict.fromkeys(newest, inspection.created)
     for place, check in enumerate(rechecks, 1):
         for one in check.components:
             if one.name in newest:
                 newest[one.name], measured[one.name], created[one.name] = one, place, check.created
+                values[one.name] = component_fingerprint(inspection, one, check.photos_hash)
     places = {one: place for place, one in enumerate([sha256, *(check.sha256 for check in rechecks)])}
     made = {one.component: one for one in content.entries if one.kind == "decision"}
     # A decision is about one measurement: a newer one of its component has to be decided about anew.
     latest = {
         name: one
         for name, one in made.items()
-        if not one.inspection_sha256 or places.get(one.inspection_sha256, -1) >= measured.get(name, 0)
+        if one.inspection_sha256 in ("", values.get(name))
+        or places.get(one.inspection_sha256, -1) >= measured.get(name, 0)
     }
     passed = {name for name, one in newest.items() if one.verdict in (Verdict.PASS, Verdict.MEASURED)}
     accepted = tuple(one for name, one in latest.items() if one.is_ok and name not in passed)
     rejected = tuple(one for one in latest.values() if not one.is_ok)
     undecided = [one for name, one in newest.items() if name not in passed and name not in latest]
-    signature = _signature(content.entries, sha256, tuple(check.sha256 for check in rechecks))
+    known = (sha256, values_fingerprint(inspection))
+    signature = _signature(content.entries, known, tuple(check.sha256 for check in rechecks))
     holds = signature is not None and not signature.void and not content.faults
     is_released = holds and not rejected and not undecided
     checked = tuple(
@@ -152,8 +159,8 @@ def state_document(state: RecordState) -> dict[str, Any]:
     }
 
 
-def _signature(entries: Sequence[Decision], sha256: str, rechecks: tuple[str, ...]) -> Signature | None:
-    """The last signature, and why it does not hold."""
+def _signature(entries: Sequence[Decision], known: Sequence[str], rechecks: tuple[str, ...]) -> Signature | None:
+    """The last signature, and why it does not hold; ``known`` are the fingerprints of the inspection."""
     places = [place for place, one in enumerate(entries) if one.kind == "signature"]
     if not places:
         return None
@@ -163,8 +170,8 @@ def _signature(entries: Sequence[Decision], sha256: str, rechecks: tuple[str, ..
         word = "decisions" if len(later) > 1 else "a decision"
         names = ", ".join(dict.fromkeys(one.component for one in later))
         return Signature(signed, f"{word} on {names} came after it")
-    if signed.inspection_sha256 != sha256:
-        return Signature(signed, "the inspection is another than the one that was signed")
+    if signed.inspection_sha256 not in known:
+        return Signature(signed, "it was made about earlier values, and they have changed since")
     if signed.rechecks != rechecks:
         return Signature(signed, "components were checked again after it, or their checks have changed")
     return Signature(signed)

@@ -94,4 +94,4 @@ def _recheck(sha256: str, document: str | None) -> Recheck:
         return Recheck(sha256, datetime.fromtimestamp(0.0, UTC), ())
     inspection = from_document(json.loads(document))
     measured = tuple(one for one in inspection.components if one.verdict is not Verdict.NOT_MEASURED)
-    return Recheck(sha256, inspection.created, measured)
+    return Recheck(sha256, inspection.created, measured, inspection.provenance.photos_hash)

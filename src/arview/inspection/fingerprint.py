@@ -1,4 +1,4 @@
-"""The fingerprint of an inspection: one hash of its content in report, results store and every export."""
+"""Fingerprints of an inspection: of its content in report, store and exports, of its values in people's decisions."""
 
 from __future__ import annotations
 
@@ -9,7 +9,10 @@ from typing import Any
 
 from arview.errors import InputError
 from arview.inspection.document import to_document
-from arview.inspection.record import Inspection
+from arview.inspection.record import ComponentDeviation, Inspection
+
+_DECIMALS = 4
+"""Decimals of values (mm, degrees) in their fingerprint: 0.1 µm, so that it does not hang on the order of sums."""
 
 
 def content_hash(document: Any) -> str:
@@ -21,6 +24,60 @@ def content_hash(document: Any) -> str:
 def fingerprint(inspection: Inspection) -> str:
     """The fingerprint of the file that `save_inspection` writes for this inspection."""
     return content_hash(to_document(inspection))
+
+
+def values_fingerprint(inspection: Inspection) -> str:
+    """SHA-256 of what was measured of which photos: values, verdicts and foreign objects, as canonical JSON.
+
+    It stays the same when the record is written again with other remarks, or with a cloud that changes no value.
+    """
+    foreign = [(list(map(_rounded, one.center_mm)), list(map(_rounded, one.size_mm))) for one in
+               inspection.foreign_objects]  # fmt: skip
+    return content_hash(
+        {
+            **_origin(inspection, inspection.provenance.photos_hash),
+            "components": [_values(one) for one in inspection.components], "foreign_objects": foreign,
+        }
+    )  # fmt: skip
+
+
+def component_fingerprint(inspection: Inspection, component: ComponentDeviation, photos_hash: str | None = None) -> str:
+    """SHA-256 of the values and the verdict of one component, as `values_fingerprint`.
+
+    Args:
+        inspection: names the specimen.
+        component: of it, or of a check of it after its rework.
+        photos_hash: of the photos of that check; None: those of the inspection.
+    """
+    photos = inspection.provenance.photos_hash if photos_hash is None else photos_hash
+    return content_hash({**_origin(inspection, photos), "components": [_values(component)]})
+
+
+def _origin(inspection: Inspection, photos_hash: str) -> dict[str, Any]:
+    return {
+        "part": inspection.part, "serial": inspection.serial, "model_hash": inspection.model_hash,
+        "photos_hash": photos_hash,
+    }  # fmt: skip
+
+
+def _values(one: ComponentDeviation) -> dict[str, Any]:
+    details = one.details
+    own = () if details is None else (details.own_displacement_mm or ())
+    return {
+        "name": one.name,
+        "displacement_mm": [_rounded(value) for value in one.displacement_mm],
+        "own_displacement_mm": [_rounded(value) for value in own],
+        "distance_mm": _rounded(one.distance_mm),
+        "rotation_deg": [_rounded(one.tilt_deg), _rounded(one.twist_deg)],
+        "uncertainty_mm": _rounded(one.uncertainty_mm),
+        "tolerance_mm": _rounded(one.tolerance_mm),
+        "verdict": one.verdict.value,
+        "finding": None if one.finding is None else one.finding.value,
+    }
+
+
+def _rounded(value: float | None) -> float | None:
+    return None if value is None else round(float(value), _DECIMALS) + 0.0
 
 
 def fingerprint_of_file(path: str | Path) -> str:

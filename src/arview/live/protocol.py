@@ -96,7 +96,7 @@ something could not be stored; then it is not confirmed.
 ``POST /api/jobs/JOB/decisions`` ``{"component", "is_ok", "reason", "note", "by", "photo": name | null}``, ``…/ticks``
 ``{"component", "step": index, "is_done", "by"}``, ``…/sign`` ``{"by", "note"}``
     201, the entry of the log, see `arview.decisions`, which a job and its re-checks share; 409 ``not_done`` while there
-    is no result, and for a signature while the cloud is made, which writes the result again.
+    is no result. A signature holds for the values and verdicts: it is void if the cloud changes one of them.
 ``GET /api/jobs/JOB/report.html``, ``inspection.json``, ``decisions.csv``, ``photos/NAME``, ``rework/COMPONENT.svg``,
 ``rework/PICTURE``
     Files of the job; a picture by the name that an instruction has for it.

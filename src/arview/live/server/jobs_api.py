@@ -246,8 +246,6 @@ class JobHandlers:
     async def sign(self, request: Request) -> Response:
         """Keep a signature."""
         job = await self._measured(request)
-        if await asyncio.to_thread(self._is_unfinished, job):
-            raise Refusal(409, "not_done", "the cloud and the report are being made; sign when they are done")
         one = await self._json(request)
         return await self._kept(job, lambda: sign_inspection(job.path, one.get("by") or "", one.get("note") or ""))
 
@@ -322,11 +320,6 @@ class JobHandlers:
         if not is_done:
             raise Refusal(409, "not_done", "this part is not measured yet")
         return job
-
-    def _is_unfinished(self, job: JobFolder) -> bool:
-        """Whether the inspection will be written again, which would make a signature void."""
-        is_worked_on = self._desk.workers.state(job.id) in ("waiting", "running")
-        return is_worked_on and job.state().cloud in ("waiting", "running")
 
     async def _document(self, job: JobFolder, status: int = 200) -> Response:
         return JSONResponse(await self._stored(lambda: job_document(job, self._desk)), status)

@@ -119,12 +119,11 @@ export class ResultsView {
     const decided = latestDecisions(job.decisions).size;
     const sign = make("button", "wide primary", [icon("pen"), t(job.signed ? "job.sign_again" : "job.sign")]);
     sign.addEventListener("click", () => this.events.onSign());
-    // The station writes the record again with the cloud, which would make a signature void.
-    sign.disabled = ["waiting", "running"].includes(job.state.cloud) && ["waiting", "running"].includes(job.worker);
+    const isEarly = ["waiting", "running"].includes(job.state.cloud) && ["waiting", "running"].includes(job.worker);
     const report = make("a", "wide", [icon("list"), t("job.report")], { href: fileOf(job.id, "report.html"), target: "_blank", rel: "noopener" });
     const table = make("a", "job-link", [t("job.csv")], { href: fileOf(job.id, "decisions.csv"), download: "" });
     const signed = job.signed ? [make("p", "job-signed", [icon("tracked"), t("job.signed", { by: job.signed.by, when: when(job.signed.time ?? job.signed.created ?? job.signed.at) })])] : [];
-    const early = sign.disabled ? [make("p", "job-quiet", [t("job.sign_later")])] : [];
+    const early = isEarly ? [make("p", "job-quiet", [t("job.sign_early")])] : [];
     const hint = !job.signed && open && !decided ? [make("p", "job-quiet", [t("job.decide_first")])] : [];
     return [...signed, ...early, ...hint, make("div", "job-ends", [sign, report]), make("p", "", [table])];
   }
