@@ -163,6 +163,11 @@ class AssemblyMonitor:
         return self._has_components and state.observations > 0 and not np.any(state.is_verified & ~self._is_base)
 
     @property
+    def rests_on_base(self) -> bool:
+        """Whether the pose was found by the base alone, and nothing else of the part has confirmed it since."""
+        return not self.is_placed and not np.any(self._state.is_verified & ~self._is_base)
+
+    @property
     def has_absent(self) -> bool:
         """Whether a component probably is not where the CAD has it."""
         return bool(self._is_suspect().any())
@@ -312,6 +317,11 @@ class AssemblyMonitor:
         """Whether two poses (4,4) are the same within bounds, or would be if the base had no other components."""
         turns = [np.eye(4), *(turn.model_from_model for turn in self._turned.turns)]
         return any(are_near(a @ turn, b, same_mm, same_deg) for turn in turns)
+
+    def shows_more(self, image: NDArray[np.uint8], pose: Array, than: Array) -> bool:
+        """Whether a picture shows more components at a pose (4,4) than at another."""
+        there, here = (self._observer.pose_evidence(image, one).seen.sum() for one in (pose, than))
+        return bool(there > here)
 
     def best_turned(self, image: NDArray[np.uint8], cam_from_model: Array, frames_lost: int | None = None) -> Array:
         """Of a pose (4,4) and those in which the base looks the same, the one of which a picture shows most.

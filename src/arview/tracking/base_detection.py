@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from arview.assembly.monitor import AssemblyMonitor
 from arview.assembly.observation import base_of
 from arview.cad.model import Model, make_model
 from arview.camera import Camera
@@ -34,6 +35,8 @@ class BaseDetectionOptions:
         recheck_frames: while no component but the base is seen, it is searched for again after so many frames, because
             it may have been mistaken; no component is called missing before it is found there once more.
         restless_frames: the same where the pose jumps while components are absent.
+        whole_frames: while a pose rests on the base alone, the whole part is searched for again after so many frames,
+            because another thing may have been mistaken for the base.
         same_share, same_deg: distance in diameters and rotation within which two poses are the same.
         alternative_share, alternative_deg: distance in diameters and rotation from which another pose that was found is
             an alternative.
@@ -47,6 +50,7 @@ class BaseDetectionOptions:
     min_width: float = 0.25
     recheck_frames: int = 15
     restless_frames: int = 8
+    whole_frames: int = 15
     same_share: float = 0.1
     same_deg: float = 12.0
     alternative_share: float = 0.25
@@ -79,7 +83,7 @@ class BaseDetection:
         self._detector_options = detector
         self._detector: Detector | None = None
         self._part: PartView | None = None
-        self._full_searches = self._frames_since = 0
+        self._full_searches = self._frames_since = self._frames_since_whole = self._whole_searches = 0
 
     @property
     def is_possible(self) -> bool:
@@ -117,6 +121,45 @@ class BaseDetection:
         self._frames_since += 1
         wait = self.options.restless_frames if is_restless else self.options.recheck_frames
         return (is_bare or is_restless) and self._frames_since >= wait
+
+    def find_whole(
+        self,
+        image: NDArray[np.uint8],
+        detector: Detector,
+        components: AssemblyMonitor,
+        cam_from_model: Array,
+        min_quality: float,
+    ) -> Detection | None:
+        """The whole part elsewhere than at a pose that rests on the base alone; another thing was taken for it then.
+
+        It is asked in each frame with such a pose and mostly searches for nothing; where the part is found at the pose,
+        it is placed there.
+
+        Args:
+            image: (H,W,3) uint8 RGB of the camera's size.
+            detector: of the whole part; its searches are made one at a time.
+            components: of the part; at the pose found the picture must show more of them.
+            cam_from_model: (4,4) mm, the pose so far.
+            min_quality: of the detection.
+        """
+        self._frames_since_whole += 1
+        if self._frames_since_whole < self.options.whole_frames:
+            return None
+        self._frames_since_whole = 0
+        self._whole_searches += 1
+        searches = [0, *detector.wider_searches]
+        found = detector.detect(image, max_results=1, searches=[searches[self._whole_searches % len(searches)]])
+        if not found or found[0].quality < min_quality:
+            return None
+        if self.is_same(components, found[0].cam_from_model, cam_from_model):
+            components.is_placed = True
+            return None
+        return found[0] if components.shows_more(image, found[0].cam_from_model, cam_from_model) else None
+
+    def is_same(self, components: AssemblyMonitor, a: Array, b: Array) -> bool:
+        """Whether two poses (4,4) are the same, or would be if the base had no other components."""
+        o = self.options
+        return components.is_same_but_turned(a, b, o.same_share * self._views.diameter_mm, o.same_deg)
 
     def _is_wide(self, cam_from_model: Array) -> bool:
         """Whether enough of the base is seen at a pose (4,4) for it not to fit every strip."""

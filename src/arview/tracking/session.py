@@ -327,9 +327,8 @@ class TrackingSession:
         self, image: NDArray[np.uint8], found: Detection, lock_quality: float
     ) -> tuple[Estimate | None, str]:
         """Accept a detection and its alternatives, see `_begin`."""
-        start = found.cam_from_model
-        self._state.hypotheses = HypothesisSet([invert(start) @ other for other in found.alternatives])
-        return self._begin(image, start, lock_quality)
+        self._state.hypotheses = _alternatives_of(found)
+        return self._begin(image, found.cam_from_model, lock_quality)
 
     def _detect_base(self, image: NDArray[np.uint8], searches: list[int] | None) -> Detection | None:
         """Detect the base of the part alone, and turn it as the picture shows the other components."""
@@ -443,6 +442,8 @@ class TrackingSession:
         has_absent = self.options.use_base_detection and self.components.has_absent
         if has_absent and self._base.is_recheck_due(self.components.is_bare, estimate.is_restless):
             estimate = self._recheck_base(image, estimate)
+        if self.components.rests_on_base:
+            estimate = self._recheck_whole(image, estimate)
         if (turn := self.components.better_turn) is not None:
             return self._restart(image, estimate.cam_from_model @ turn.model_from_model, turn), reason
         if not s.hypotheses:
@@ -460,17 +461,23 @@ class TrackingSession:
 
     def _recheck_base(self, image: NDArray[np.uint8], estimate: Estimate) -> Estimate:
         """Search again for a part of which little is seen, and go on where it is if that is elsewhere."""
-        o, found = self._base.options, self._detect_base(image, [0])
-        same_mm = o.same_share * self.views.diameter_mm
-        if found is None or self.components.is_same_but_turned(
-            found.cam_from_model, estimate.cam_from_model, same_mm, o.same_deg
-        ):
+        found = self._detect_base(image, [0])
+        if found is None or self._base.is_same(self.components, found.cam_from_model, estimate.cam_from_model):
             self.components.is_placed |= found is not None
             return estimate
         self._expect_base(found.cam_from_model)
         estimate = self._restart(image, found.cam_from_model)
         self.components.is_placed = False
         return estimate
+
+    def _recheck_whole(self, image: NDArray[np.uint8], estimate: Estimate) -> Estimate:
+        """Go on where the whole part is found, if only its base was found before and that elsewhere."""
+        pose, components = estimate.cam_from_model, self.components
+        found = self._base.find_whole(image, self.detector, components, pose, self.options.lock_quality)
+        if found is None or self._is_other(found.cam_from_model):
+            return estimate
+        self._state.hypotheses = _alternatives_of(found)
+        return self._restart(image, found.cam_from_model)
 
     def _check_components(self, image: NDArray[np.uint8], estimate: Estimate, reason: str) -> str:
         """Check that the components are where the CAD has them; a part with a wrong one is never ``tracked``."""
@@ -493,3 +500,7 @@ class TrackingSession:
             self.appearance_memory.learn(image, estimate, is_sure)
         if is_sure:
             self._state.last_sure_pose = estimate.cam_from_model
+
+
+def _alternatives_of(found: Detection) -> HypothesisSet:
+    return HypothesisSet([invert(found.cam_from_model) @ other for other in found.alternatives])
