@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from arview.assembly.monitor import AssemblyMonitor
 from arview.assembly.turned_poses import base_turns
+from arview.detection.detector import Detector
 from arview.geometry import Array, apply
 from arview.pose import Presence
 from arview.refinement.view_model import PartView
@@ -75,3 +77,33 @@ def test_a_session_finds_a_bare_base_and_says_of_nothing_that_it_is_present() ->
             assert is_right(result.cam_from_model, pose)
             assert not any(result.components[name].presence is Presence.PRESENT for name in NAMES[1:])
     assert followed >= 8
+
+
+@pytest.mark.slow
+def test_the_whole_part_is_found_where_another_thing_was_taken_for_its_base() -> None:
+    monitor, detector = AssemblyMonitor(assembly_views(), CAMERA, assembly()), Detector(assembly_views(), CAMERA)
+    truth = pose_from(20, 40, 520)
+    elsewhere = truth.copy()
+    elsewhere[:3, 3] += [90.0, -40.0, 60.0]
+    image = picture(truth, assembly(), seed=3, scene=1, noise=3.0)
+    for start, is_moved in ((elsewhere, True), (truth, False)):
+        detection = BaseDetection(assembly_views(), CAMERA, assembly())
+        monitor.is_placed = False
+        assert monitor.rests_on_base
+        frames = detection.options.whole_frames
+        found = [detection.find_whole(image, detector, monitor, start, 0.8) for _ in range(frames)]
+        assert found[:-1] == [None] * (frames - 1), "a search in every frame would be too slow"
+        if is_moved:
+            assert found[-1] is not None and np.allclose(found[-1].cam_from_model, truth, atol=3.0)
+            assert monitor.rests_on_base
+        else:
+            assert found[-1] is None and monitor.is_placed
+
+
+@pytest.mark.slow
+def test_a_bare_base_is_not_left_for_the_whole_part() -> None:
+    monitor, detector = AssemblyMonitor(assembly_views(), CAMERA, assembly()), Detector(assembly_views(), CAMERA)
+    detection, truth = BaseDetection(assembly_views(), CAMERA, assembly()), pose_from(20, 40, 520)
+    image = picture(truth, BARE, seed=3, scene=1, noise=3.0)
+    searches = 6 * detection.options.whole_frames
+    assert all(detection.find_whole(image, detector, monitor, truth, 0.8) is None for _ in range(searches))

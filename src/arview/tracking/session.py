@@ -205,11 +205,7 @@ class TrackingSession:
         known = self.identity.update(image, estimate, index, time_s, self, self._state.is_confirmed)
         if known.cam_from_model is not None and estimate is not None:
             estimate = self._restart(image, known.cam_from_model)
-        elif (
-            estimate is not None
-            and self._state.is_confirmed
-            and known.identity in (Identity.FOLLOWED, Identity.CONFIRMED)
-        ):
+        elif estimate is not None and self._state.is_confirmed and known.identity in SAME_SPECIMEN:
             self.components.resume(estimate.cam_from_model, self._state.frames_without_pose)
         ms = (time.perf_counter() - started) * 1e3
         if estimate is None:
@@ -333,9 +329,7 @@ class TrackingSession:
     def _detect_base(self, image: NDArray[np.uint8], searches: list[int] | None) -> Detection | None:
         """Detect the base of the part alone, and turn it as the picture shows the other components."""
         found = [one for one in self._base.detect(image, searches) if not self._is_other(one.cam_from_model)]
-        if not found:
-            return None
-        return self._as_before(image, found[0])
+        return self._as_before(image, found[0]) if found else None
 
     def _as_before(self, image: NDArray[np.uint8], found: Detection) -> Detection:
         """A detection, turned as the picture shows the components, and as the part lay before a short loss."""
@@ -472,8 +466,8 @@ class TrackingSession:
 
     def _recheck_whole(self, image: NDArray[np.uint8], estimate: Estimate) -> Estimate:
         """Go on where the whole part is found, if only its base was found before and that elsewhere."""
-        pose, components = estimate.cam_from_model, self.components
-        found = self._base.find_whole(image, self.detector, components, pose, self.options.lock_quality)
+        o, pose = self.options, estimate.cam_from_model
+        found = self._base.find_whole(image, self.detector, self.components, pose, o.lock_quality)
         if found is None or self._is_other(found.cam_from_model):
             return estimate
         self._state.hypotheses = _alternatives_of(found)
@@ -484,9 +478,9 @@ class TrackingSession:
         s = self._state
         s.is_supported = s.state == TrackingState.TRACKED
         self.components.update(image, estimate.cam_from_model, estimate.quality, s.is_supported)
-        whole, pose = self._local.refiner.part, estimate.cam_from_model
-        self.tracker.refiner.part = self.components.present_lines(whole, pose, self._base.part)
-        reasons = [reason, *self.components.mismatches] if reason else [*self.components.mismatches]
+        whole = self._local.refiner.part
+        self.tracker.refiner.part = self.components.present_lines(whole, estimate.cam_from_model, self._base.part)
+        reasons = [one for one in (reason, *self.components.mismatches) if one]
         if self.components.uncertain and not reasons:
             reasons = [f"in doubt: {', '.join(self.components.uncertain)}"]
         if reasons:
