@@ -56,7 +56,7 @@ def _compared(views: GuideViewSet, other: Part) -> PartLikeness:
     index = int(np.argmax(likeness))
     most = (
         f"most alike: {describe_view(views, index)} and its {describe_view(other_views, int(partner[index]))}, "
-        f"likeness {likeness[index]:.2f} of {CONFUSABLE_LIKENESS:.2f}"
+        f"likeness {likeness[index]:.2f}; from {CONFUSABLE_LIKENESS:.2f} on views are confusable"
     )
     sizes = f"{views.diameter_mm:.0f} and {other_views.diameter_mm:.0f} mm across"
     is_confusable = share > MAX_WEAK_SHARE

@@ -63,7 +63,7 @@ export function shown(value, digits = 2) {
   return value === null || value === undefined ? "–" : String(Number(value.toFixed(digits)));
 }
 
-export const percent = (share) => `${Math.round(100 * share)} %`;
+export const percent = (share) => `${Math.round(100 * share)}%`;
 
 /** Call a function once, some time after the last call. */
 export function delayed(work, wait_ms) {

@@ -50,6 +50,7 @@ tabs.add(TextTab, store);
 
 /* --- the 3D view ---------------------------------------------------------------------------------------- */
 
+const OUTER_REACH = 0.85; // of the outer shell: all of it would make the part too small
 let isIgnoredShown = false, loaded = "";
 
 const indexOf = (name) => store.part.components.findIndex((one) => one.name === name);
@@ -99,7 +100,8 @@ function showTab(name, before) {
 
 /** Radius, mm, of what the open tab shows. */
 function reach() {
-  return ["Range", "Views", "Photos"].includes(tabs.current) ? 1.1 * shell.radius : stage.radius;
+  if (!["Range", "Views", "Photos"].includes(tabs.current)) return stage.radius;
+  return Math.max(1.1 * shell.radius, tabs.current === "Photos" ? 0 : OUTER_REACH * shell.outerRadius);
 }
 
 /** What the open tab shows around the part. */
@@ -133,6 +135,7 @@ function peek(index, x, y) {
   figure.style.transform = `translate(${Math.max(4, left)}px, ${Math.max(4, Math.min(y - 40, stage.height - 280))}px)`;
 }
 
+window.matchMedia("(prefers-color-scheme: light)").addEventListener("change", () => stage.draw()); // the signs are drawn in its colours
 stage.addEventListener("drawn", ({ detail }) => document.dispatchEvent(new CustomEvent("arview:drawn", { detail })));
 stage.addEventListener("hover", ({ detail }) => {
   const name = detail.index === null ? null : store.part?.components[detail.index]?.name ?? null;

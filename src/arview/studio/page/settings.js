@@ -22,7 +22,7 @@ export class Settings {
       return;
     }
     const { assembly } = this.store, title = assembly ? `${assembly.split("/").at(-1)}/*` : rows.length === 1 ? rows[0].name : `${rows.length} components`;
-    const size = rows.length === 1 ? rows[0].size_mm.map((one) => shown(one, 1)).join(" × ") + " mm" : `${rows.length} components`;
+    const size = rows.length === 1 ? rows[0].size_mm.map((one) => shown(one, 1)).join(" × ") + " mm" : assembly ? `${rows.length} components` : "";
     this.form.replaceChildren(
       make("h2", {}, title, make("small", {}, size)),
       field("Role", this.#roles(shared(rows, "role"))),

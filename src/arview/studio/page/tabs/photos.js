@@ -1,7 +1,7 @@
 // Tab "Photos": where to stand, what each component is seen from, and the U to be expected against its tolerance.
 
 import { get } from "../api.js";
-import { delayed, icon, make, shown } from "../dom.js";
+import { delayed, icon, make } from "../dom.js";
 
 export class PhotosTab {
   title = "Photos";
@@ -52,7 +52,7 @@ export class PhotosTab {
       class: isWide ? "is-wide" : "", title: row.remark || (isWide ? "U is more than a quarter of the tolerance" : ""), "data-name": row.name,
       onpointerenter: () => this.store.hover(row.name), onpointerleave: () => this.store.hover(null), onclick: () => this.store.select([row.name]),
     }, make("th", { scope: "row" }, row.name), make("td", {}, `${row.photos.length}/${count}`), make("td", {}, `${Math.round(row.spread_deg)}°`),
-    make("td", {}, u === null ? "–" : `${shown(u, 3)} mm`), make("td", {}, verdict, tolerance === null ? "–" : `±${tolerance} mm`));
+    make("td", {}, u === null ? "–" : `${u.toFixed(3)} mm`), make("td", {}, verdict, tolerance === null ? "–" : `±${tolerance} mm`));
     return row.remark ? (element.firstChild.append(make("small", {}, row.remark)), element) : element;
   }
 

@@ -72,7 +72,7 @@ export class ViewsTab {
     const rows = answer.advice.map(({ text, score, edit }) => make("li", { class: "card" },
       make("div", {}, make("b", {}, text), make("small", {}, `share of distinct views: ${percent(this.store.views?.score ?? 0)} → ${percent(score)}`)),
       make("button", { class: "small-button", type: "button", onclick: () => this.store.edit(edit) }, "Apply")));
-    this.advice.replaceChildren(...(rows.length ? rows : [make("li", { class: "card" }, "None of the changes that were tried is better. Components around the part, once they are in the CAD, would help.")]));
+    this.advice.replaceChildren(...(rows.length ? rows : [make("li", { class: "card" }, (this.store.views?.score ?? 0) >= 1 ? "Every view is distinct already: no change is needed." : "None of the changes that were tried is better. Components around the part, once they are in the CAD, would help.")]));
   }
 }
 

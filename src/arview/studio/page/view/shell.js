@@ -5,7 +5,7 @@ import { make } from "../dom.js";
 
 const { THREE } = window;
 
-const STEPS_DEG = 5, FULL_DEG = 359.5;
+const STEPS_DEG = 5, FULL_DEG = 359.5, HANDLE_PX = [62, 26];
 const BORDERS = [
   ["azimuth_deg", 0, "Least azimuth"], ["azimuth_deg", 1, "Greatest azimuth"],
   ["elevation_deg", 0, "Least elevation"], ["elevation_deg", 1, "Greatest elevation"],
@@ -43,6 +43,11 @@ export class Shell {
   /** Radius at which the dots of views and photos are drawn, mm. */
   get radius() {
     return this.#range?.distance_mm[0] ?? 1;
+  }
+
+  /** Radius of the outer border, mm. */
+  get outerRadius() {
+    return this.#range?.distance_mm[1] ?? 1;
   }
 
   #build() {
@@ -83,6 +88,7 @@ export class Shell {
   }
 
   #place() {
+    const placed = [];
     for (const { element, key, side } of this.handles) {
       element.hidden = !this.#canDrag;
       if (element.hidden) continue;
@@ -91,7 +97,9 @@ export class Shell {
       const toEye = unit(plus(this.stage.camera.position.toArray(), this.stage.center.toArray(), -1));
       const isBehind = dot(toEye, unit(plus(anchor, this.stage.center.toArray(), -1))) < -0.1;
       element.classList.toggle("behind", isBehind);
-      element.style.transform = `translate(${x.toFixed(1)}px, ${y.toFixed(1)}px) translate(-50%, -50%)`;
+      const free = element.hidden ? y : freeHeight(placed, x, y);
+      if (!element.hidden) placed.push([x, free]);
+      element.style.transform = `translate(${x.toFixed(1)}px, ${free.toFixed(1)}px) translate(-50%, -50%)`;
       const unitText = key === "distance_mm" ? " mm" : "°", text = `${Math.round(this.#range[key][side])}${unitText}`;
       element.querySelector("span").textContent = text;
       element.setAttribute("aria-valuenow", Math.round(this.#range[key][side]));
@@ -164,6 +172,14 @@ export class Shell {
     this.stage.extent = 1.05 * this.#range.distance_mm[1];
     this.stage.draw();
   }
+}
+
+/** The height at which a handle covers none of those that are placed already: further down where it would. */
+function freeHeight(placed, x, y) {
+  for (const [left, top] of [...placed].sort((one, other) => one[1] - other[1])) {
+    if (Math.abs(left - x) < HANDLE_PX[0] && Math.abs(top - y) < HANDLE_PX[1]) y = top + HANDLE_PX[1];
+  }
+  return y;
 }
 
 const dist = (a, b) => Math.hypot(a[0] - b[0], a[1] - b[1], a[2] - b[2]);
