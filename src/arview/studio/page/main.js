@@ -50,7 +50,6 @@ tabs.add(TextTab, store);
 
 /* --- the 3D view ---------------------------------------------------------------------------------------- */
 
-const OUTER_REACH = 0.85; // of the outer shell: all of it would make the part too small
 let isIgnoredShown = false, loaded = "";
 
 const indexOf = (name) => store.part.components.findIndex((one) => one.name === name);
@@ -100,8 +99,7 @@ function showTab(name, before) {
 
 /** Radius, mm, of what the open tab shows. */
 function reach() {
-  if (!["Range", "Views", "Photos"].includes(tabs.current)) return stage.radius;
-  return Math.max(1.1 * shell.radius, tabs.current === "Photos" ? 0 : OUTER_REACH * shell.outerRadius);
+  return ["Range", "Views", "Photos"].includes(tabs.current) ? 1.1 * shell.radius : stage.radius;
 }
 
 /** What the open tab shows around the part. */

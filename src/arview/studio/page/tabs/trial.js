@@ -52,7 +52,7 @@ export class TrialTab {
     const count = answer.frames === 1 ? "" : ` in ${answer.tracked} of ${answer.frames} frames`;
     this.result.replaceChildren(
       make("div", { class: `verdict-box ${isTracked ? "pass" : "fail"}` }, icon(isTracked ? "pass" : "fail"),
-        make("div", {}, make("b", { class: "trial-state" }, `${isTracked ? "tracked" : "not found"}${count}`), make("div", {}, isTracked ? `quality ${percent(answer.quality)}${answer.reason ? `; ${answer.reason}` : ""}` : answer.reason || "no reason is known"))),
+        make("div", {}, make("b", { class: "trial-state" }, `${isTracked ? "tracked" : "not found"}${count}`), make("div", {}, isTracked ? `quality ${percent(answer.quality)}${answer.reason ? `; ${answer.reason}` : ""}` : (answer.reason || "no reason is known").replace(/^not found:\s*/, "")))),
       large, this.#presence(answer.components));
   }
 

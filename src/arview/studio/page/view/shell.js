@@ -45,11 +45,6 @@ export class Shell {
     return this.#range?.distance_mm[0] ?? 1;
   }
 
-  /** Radius of the outer border, mm. */
-  get outerRadius() {
-    return this.#range?.distance_mm[1] ?? 1;
-  }
-
   #build() {
     const { distance_mm: [near, far], azimuth_deg: [a0, a1], elevation_deg: [e0, e1] } = this.#range;
     const columns = Math.max(1, Math.ceil((a1 - a0) / STEPS_DEG)), rows = Math.max(1, Math.ceil((e1 - e0) / STEPS_DEG));
