@@ -210,6 +210,34 @@ def test_result_comes_without_a_reload_and_is_signed(chromium: Any, server: Runn
     assert said["sign"] == {"by": "M. Lang", "note": ""}
 
 
+def test_a_photo_is_taken_for_a_decision(chromium: Any, server: Running, jobs: ToldJobs) -> None:
+    found = {"verdict": "fail", "sentence": "", "components": components(), "created": ""}
+    with opened(chromium, server, WATCH, PHONE) as page:
+        job = capture(page, jobs)
+        job.update(inspection=found, state={**job["state"], "stage": "done", "cloud": "done"})
+        page.click("#job .component[data-name=post_1]")
+        page.fill("#job-note", "bent")
+        page.fill("#job-by", "M. Lang")
+        page.fill("#job-reason", "Scrap")
+        page.check("#job-ok-no")
+        jobs.is_gone = True  # the network is cut: the decision waits for its photo
+        page.get_by_role("button", name="Take a photo now").click()
+        until(page, lambda: "kept on this device" in page.inner_text("#job .job-photo [role=status]"))
+        until(page, "document.querySelector('#job .job-photo img').naturalWidth > 0")
+        page.locator("#job .job-form .primary").click()
+        page.wait_for_timeout(1500)
+        assert not jobs.said and not jobs.attached
+        assert page.input_value("#job-note") == "bent"
+        jobs.is_gone = False
+        until(page, lambda: any(name == "decisions" for name, _ in jobs.said))
+        (content,) = jobs.attached
+        assert content[:3] == b"\xff\xd8\xff" and not jobs.stored and job["photos"] == []
+        said = dict(jobs.said)["decisions"]
+        assert said["photo"] == f"decisions/{hashlib.sha256(content).hexdigest()}.jpg" and said["note"] == "bent"
+        page.click("#job .component[data-name=post_1]")
+        until(page, "document.querySelector('#job .job-drawing[alt^=\"Photo taken for\"]').naturalWidth > 0")
+
+
 def test_check_again_shows_before_and_after(chromium: Any, server: Running, jobs: ToldJobs) -> None:
     found = {"verdict": "fail", "sentence": "", "components": components(), "created": ""}
     with opened(chromium, server, WATCH, PHONE) as page:

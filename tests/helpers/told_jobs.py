@@ -30,6 +30,7 @@ class ToldJobs:
     Attributes:
         jobs: documents by id.
         stored: content of the photos that arrived, in order.
+        attached: content of those that were taken for decisions.
         uploads: content so far by the name of an upload.
         refusals: the next answers to pieces: status and document; an empty list answers as a station does.
         lost: number of the next pieces that arrive while their answers do not.
@@ -38,6 +39,7 @@ class ToldJobs:
 
     jobs: dict[str, dict[str, Any]] = field(default_factory=dict)
     stored: list[bytes] = field(default_factory=list)
+    attached: list[bytes] = field(default_factory=list)
     uploads: dict[str, bytearray] = field(default_factory=dict)
     begun: dict[str, dict[str, Any]] = field(default_factory=dict)
     refusals: list[tuple[int, dict[str, Any]]] = field(default_factory=list)
@@ -54,7 +56,7 @@ class ToldJobs:
         """Add a job."""
         job = {
             "id": name, "part": "bracket_plate/part.toml", "part_name": "bracket_plate", "serial": "BP-1",
-            "created": "2026-11-27T06:12:00Z", "parent": None, "photos": [], "inspection": None,
+            "created": "2026-11-27T06:12:00Z", "parent": None, "photos": [], "attachments": [], "inspection": None,
             "rework": [], "decisions": [], "signed": None, "rechecks": [], "before_after": [], "components": None,
             "state": {"stage": "collecting", "text": "", "photos": 0, "placed": 0, "step": "", "done": 0, "total": 0,
                       "is_rough": False, "cloud": "waiting"},
@@ -90,6 +92,8 @@ class ToldJobs:
         if method == "GET":
             if rest == "capture":
                 return 200, {"cells": CELLS, "distance_mm": [330.0, 520.0], "wanted_photos": 20}
+            if rest.startswith("photos/decisions/"):
+                return 200, self.attached[job["attachments"].index(rest.split("/", 1)[1])]
             if rest.startswith("photos/") and self.stored:
                 return 200, self.stored[job["photos"].index(rest.split("/")[1]) % len(self.stored)]
             return (200, job) if not rest else (200, DRAWING) if rest.startswith("rework") else (404, {})
@@ -135,6 +139,10 @@ class ToldJobs:
         if hashlib.sha256(kept).hexdigest() != about["sha256"]:
             del self.uploads[upload]
             return 422, {"error": "bad_hash", "message": "the photo arrived damaged"}
+        if about["purpose"] == "decide":
+            self.attached.append(bytes(kept))
+            job["attachments"].append(f"decisions/{about['sha256']}.jpg")
+            return 200, {"photo": job["attachments"][-1]}
         self.stored.append(bytes(kept))
         photo = f"{len(self.stored):04d}.jpg"
         job["photos"].append(photo)

@@ -268,6 +268,44 @@ def test_decisions_ticks_and_signature(page: Http, folder: Path) -> None:
     assert status == 200 and headers["content-security-policy"].startswith("sandbox")
 
 
+def test_a_photo_taken_for_a_decision_is_in_the_record_and_is_not_measured(page: Http, folder: Path) -> None:
+    job = started(page)
+    send(page, job, photo(1))
+    measured(on_disk(folder, job))
+    base, content = f"/api/jobs/{job}", photo(2)
+    said = about(content, purpose="decide", hint=None)
+    status, begun = page.json("POST", f"{base}/uploads", said)
+    assert status == 201
+    # The connection is cut after the first piece: nothing is there to decide with, and the rest continues.
+    assert piece(page, job, begun["upload"], 0, content[:70_000])[1] == {"offset": 70_000}
+    told = page.json("GET", base)[1]
+    assert told["attachments"] == [] and told["photos"] == ["0001.jpg"]
+    name = f"decisions/{said['sha256']}.jpg"
+    decision = {"component": "post_1", "is_ok": False, "reason": "bent", "by": "Ada", "photo": name}
+    status, refused = page.json("POST", f"{base}/decisions", decision)
+    assert status == 400 and "is missing" in refused["message"]
+    assert send(page, job, content, purpose="decide", hint=None) == name
+    assert send(page, job, content, purpose="decide", hint=None) == name
+    told = page.json("GET", base)[1]
+    assert told["attachments"] == [name] and told["photos"] == ["0001.jpg"] and told["state"]["stage"] == "done"
+    # A job's photo may be attached as well: it is kept on its own.
+    other = send(page, job, photo(1), purpose="decide", hint=None)
+    assert other.startswith("decisions/") and page.json("GET", base)[1]["attachments"] == [name, other]
+    assert page.json("POST", f"{base}/decisions", decision)[0] == 201
+    assert page.ask("GET", f"{base}/photos/{name}")[2] == content
+    assert name in page.ask("GET", f"{base}/decisions.csv")[2].decode()
+    assert page.json("GET", base)[1]["record"]["faults"] == []
+    for wrong in ("decisions/../job.json", f"decisions/{'0' * 64}.jpg", "decisions/x.jpg"):
+        assert page.json("POST", f"{base}/decisions", {**decision, "photo": wrong})[0] == 400
+        assert page.ask("GET", f"{base}/photos/{wrong}")[0] == 404
+    assert page.json("POST", f"{base}/uploads", {**said, "purpose": "else"})[0] == 400
+    kept = on_disk(folder, job).path / name
+    kept.write_bytes(content[:-1] + b"x")
+    record = page.json("GET", base)[1]["record"]
+    assert "post_1 (entry 1) was changed" in record["faults"][0] and not record["is_released"]
+    assert record["sentence"].startswith("not valid")
+
+
 def test_rework_and_its_drawing(page: Http, folder: Path) -> None:
     job = started(page)
     measured(on_disk(folder, job))

@@ -1,5 +1,6 @@
 """Decisions by people about an inspection: an append-only log, sign-off, and what they say of the part together."""
 
+from arview.decisions.attachments import attach_photo, attached_photos, is_attachment
 from arview.decisions.entry import Decision, decision_document
 from arview.decisions.folder import (
     decide_component,
@@ -18,10 +19,13 @@ __all__ = [
     "DecisionLog",
     "RecordState",
     "Signature",
+    "attach_photo",
+    "attached_photos",
     "decide_component",
     "decision_document",
     "decisions_csv",
     "decisions_path",
+    "is_attachment",
     "log_of",
     "record_state",
     "sign_inspection",

@@ -7,8 +7,10 @@ A job folder may hold checks of reworked components, ``recheck/01``, ``recheck/0
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
+from arview.decisions.attachments import attachment_faults, is_attachment, photo_fault
 from arview.decisions.entry import Decision, checked_name, checked_text
 from arview.decisions.log import DecisionLog
 from arview.decisions.record import Recheck, RecordState, record_state
@@ -99,7 +101,13 @@ def state_of_record(target: str | Path, inspection: Inspection | None = None) ->
     if inspection is None or path != inspection_path(target):
         inspection = load_inspection(path)
     rechecks = [check for _, check in rechecks_of(path)]
-    return record_state(inspection, fingerprint_of_file(path), log_of(path).content(), rechecks)
+    content = log_of(path).content()
+    state = record_state(inspection, fingerprint_of_file(path), content, rechecks)
+    faults = attachment_faults(path.parent, content.entries)
+    if not faults:
+        return state
+    sentence = state.sentence if state.faults else f"not valid: {faults[0]}"
+    return replace(state, sentence=sentence, is_released=False, faults=(*state.faults, *faults))
 
 
 def decide_component(
@@ -108,7 +116,8 @@ def decide_component(
 ) -> Decision:  # fmt: skip
     """Add a decision about a component of the inspection of a folder or file, and check what it says.
 
-    It is about the newest measurement of the component. A photo of a re-check is kept as ``recheck/NN/NAME``.
+    It is about the newest measurement of the component. A photo of a re-check is kept as ``recheck/NN/NAME``; one that
+    was taken for the decision has the name that `attach_photo` gave it.
 
     Raises:
         InputError: the inspection has no such component, a component that did not pass is accepted without a reason,
@@ -169,6 +178,8 @@ def sign_inspection(target: str | Path, by: str, note: str = "") -> Decision:
 def photo_path(target: str | Path, photo: str) -> Path | None:
     """The file of a photo that a decision names; None if the name is not one that `decide_component` makes."""
     folder = first_inspection(target).parent
+    if is_attachment(photo):
+        return folder / photo
     parts = photo.split("/")
     if len(parts) == 3 and parts[0] == _RECHECK:
         folder, parts = folder / _RECHECK / parts[1], parts[2:]
@@ -189,6 +200,10 @@ def _read(target: str | Path) -> tuple[Path, Inspection]:
 def _kept_photo(path: Path, first: Path, photo: object) -> str:
     """The name under which a photo of a folder is kept in the log of the first measurement, checked."""
     name = checked_name(photo, "photo")
+    if is_attachment(name):
+        if fault := photo_fault(first.parent, name):
+            raise InputError(f"photo: {name} {fault}; take it again")
+        return name
     if "/" in name or "\\" in name or name.startswith("."):
         raise InputError(f"photo: {name!r} is not the name of a photo")
     photos = path.parent / "photos"

@@ -80,14 +80,16 @@ something could not be stored; then it is not confirmed.
     Announce a photo: JPEG, PNG or HEIC. ``source``: "still" | "stream" | "upload" | "station"; ``hint`` | null:
     ``{"cam_from_model": [16] | null, "camera": as in *Pose* | null, "quality": 0 to 1 | null}``. 201 ``{"upload",
     "offset"}``: where to go on, above 0 for one that was begun before; 200 ``{"photo": name}`` if it is stored. 413
-    ``too_large``, 415 ``bad_type``, 429 ``too_many``.
+    ``too_large``, 415 ``bad_type``, 429 ``too_many``. With ``"purpose": "decide"`` the photo is kept for a decision
+    and not measured: its name is ``decisions/`` and the hash.
 ``GET /api/jobs/JOB/uploads/UPLOAD``
     ``{"offset"}``, of a stored photo with ``photo``; 404 ``no_such_upload``.
 ``PATCH /api/jobs/JOB/uploads/UPLOAD?offset=N``, body: the next bytes, 1 MiB at most
     ``{"offset"}``, or after the last ones ``{"photo": name}``. 409 ``bad_offset`` with the right ``offset``; 422
     ``bad_hash`` and ``bad_photo``: the upload is dropped, and can be begun again.
 ``POST /api/jobs/JOB/take`` ``{"client"}``
-    Store the newest frame of a client that is bound to the job, with its pose: 201 ``{"photo"}``. 409 ``other_job``,
+    Store the newest frame of a client that is bound to the job, with its pose: 201 ``{"photo"}``. With
+    ``"purpose": "decide"`` it is kept for a decision, as in an announcement. 409 ``other_job``,
     ``no_such_frame``.
 ``POST /api/jobs/JOB/end``, ``POST /api/jobs/JOB/reopen``
     No more photos come, or more come after all: *Job*. A photo that was announced before still counts after the end.
@@ -194,7 +196,8 @@ Control, every key and every key of ``style`` may be absent::
 Job::
 
     {"id", "part": number | null, "part_name", "serial", "model_hash", "created", "camera", "parent", "components",
-     "state": state.json, "is_ended", "photos": [names], "uploads": [{"upload", "bytes", "offset"}], "worker": as above,
+     "state": state.json, "is_ended", "photos": [names],
+     "attachments": [names of photos taken for decisions], "uploads": [{"upload", "bytes", "offset"}], "worker": as above,
      "faults": [texts], damaged lines of the list of photos,
      "inspection": {"created", "verdict", "sentence", "note", "components": [{"name", "verdict", "value_text",
                     "detail_text", "distance_mm", "uncertainty_mm"}]} | null,

@@ -6,7 +6,7 @@ import logging
 from dataclasses import asdict
 from typing import Any
 
-from arview.decisions import decision_document, log_of, state_document, state_of_record
+from arview.decisions import attached_photos, decision_document, log_of, state_document, state_of_record
 from arview.errors import ArviewError
 from arview.inspection import Inspection, Verdict
 from arview.inspection.summary import overall_verdict, verdict_sentence
@@ -52,6 +52,7 @@ def job_document(job: JobFolder, desk: JobDesk) -> Document:
         "state": job.state().document(),
         "is_ended": job.is_ended,
         "photos": [photo.name for photo in job.photos()],
+        "attachments": attached_photos((job.parent or job).path),
         "uploads": [
             {"upload": one.name, "bytes": one.bytes, "offset": one.offset} for one in board.uploads(job).listed()
         ],

@@ -22,10 +22,11 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, Literal, get_args
 
 from arview.camera.exif import check_jpeg_scans
 from arview.core.atomic import write_file
+from arview.decisions import attach_photo, attached_photos
 from arview.errors import InputError, OutputError
 from arview.live.options import JobOptions
 from arview.live.security.refusals import Refusal
@@ -36,6 +37,8 @@ logger = logging.getLogger("arview.live")
 
 MEDIA_TYPES = ("image/jpeg", "image/png", "image/heic", "image/heif")
 """Kinds of photos that are accepted."""
+Purpose = Literal["measure", "decide"]
+"""What a photo is for: it is measured, or it shows what a person decides."""
 MIN_SIDE_PX = 64
 _SHA256 = re.compile(r"[0-9a-f]{64}")
 _NAME = re.compile(r"[0-9a-f]{32}")
@@ -47,11 +50,12 @@ class Upload:
     """An upload that is not complete.
 
     Attributes:
-        name: in URLs; the first half of the hash.
+        name: in URLs; the first half of the hash, for a decision that of a hash of it.
         bytes: size of the whole photo.
         sha256: hash of the whole photo, hexadecimal.
         source, hint, taken: see `StoredPhoto`.
         offset: bytes that have arrived.
+        purpose: what the photo is for.
     """
 
     name: str
@@ -61,6 +65,7 @@ class Upload:
     hint: Mapping[str, Any] | None
     taken: str
     offset: int = 0
+    purpose: Purpose = "measure"
 
 
 class Uploads:
@@ -85,11 +90,11 @@ class Uploads:
         """
         wanted = self._checked(request)
         with self._lock:
-            if (name := self._stored(wanted.name, wanted.sha256)) is not None:
+            if (name := self._stored(wanted.name)) is not None:
                 return name
             if (known := self._read(wanted.name)) is not None:
                 return known
-            if len(self._job.photos()) >= self._options.max_photos:
+            if self._count(wanted.purpose) >= self._options.max_photos:
                 raise Refusal(429, "too_many", f"this inspection has {self._options.max_photos} photos already")
             if len(self._names()) >= self._options.max_open_uploads:
                 raise Refusal(429, "too_many", "too many uploads are not complete", {"Retry-After": "5"})
@@ -100,6 +105,7 @@ class Uploads:
                 "source": wanted.source,
                 "hint": wanted.hint,
                 "taken": wanted.taken,
+                "purpose": wanted.purpose,
             }
             try:
                 write_file(self._folder / f"{wanted.name}.json", json.dumps(document).encode(), makes_folder=True)
@@ -170,22 +176,32 @@ class Uploads:
             raise Refusal(400, "bad_request", "sha256: expected 64 hexadecimal digits in lower case")
         if source not in get_args(PhotoOrigin):
             raise Refusal(400, "bad_request", f"source: expected one of {', '.join(get_args(PhotoOrigin))}")
+        purpose = request.get("purpose", "measure")
+        if purpose not in get_args(Purpose):
+            raise Refusal(400, "bad_request", f"purpose: expected one of {', '.join(get_args(Purpose))}")
         hint = request.get("hint")
         if hint is not None and not isinstance(hint, dict):
             raise Refusal(400, "bad_request", "hint: expected an object")
         try:
             return Upload(
-                sha256[:32], size, sha256, source, checked_hint(hint), checked_time(request.get("taken"))
+                _name_of(sha256, purpose), size, sha256, source, checked_hint(hint), checked_time(request.get("taken")),
+                purpose=purpose,
             )  # fmt: skip
         except InputError as error:
             raise Refusal(400, "bad_request", str(error)) from error
 
-    def _stored(self, name: str, sha256: str = "") -> str | None:
+    def _stored(self, name: str) -> str | None:
         """Name of the photo that an upload has become, or None."""
         for photo in self._job.photos():
-            if photo.sha256 == sha256 or (not sha256 and photo.sha256[:32] == name):
+            if _name_of(photo.sha256, "measure") == name:
                 return photo.name
+        for attached in attached_photos(record_folder(self._job)):
+            if _name_of(Path(attached).stem, "decide") == name:
+                return attached
         return None
+
+    def _count(self, purpose: Purpose) -> int:
+        return len(self._job.photos() if purpose == "measure" else attached_photos(record_folder(self._job)))
 
     def _known(self, name: str) -> Upload:
         upload = self._read(name)
@@ -243,7 +259,10 @@ class Uploads:
         except InputError as error:
             self._drop(upload.name)
             raise Refusal(422, "bad_photo", str(error)) from error
-        photo = store_photo(self._job, content, upload.sha256, upload.source, upload.hint, upload.taken)
+        if upload.purpose == "decide":
+            photo = store_attachment(self._job, content)
+        else:
+            photo = store_photo(self._job, content, upload.sha256, upload.source, upload.hint, upload.taken)
         self._drop(upload.name)
         return photo
 
@@ -315,6 +334,30 @@ def store_photo(
         raise Refusal(422, "bad_photo", str(error)) from error
     except (OutputError, OSError) as error:
         raise _not_stored(error) from error
+
+
+def store_attachment(job: JobFolder, content: bytes) -> str:
+    """Store a photo that was taken for a decision, durably; returns its name. It is not measured.
+
+    Raises:
+        Refusal: the photo cannot be used, or the disk is full.
+    """
+    try:
+        return attach_photo(record_folder(job), content)
+    except InputError as error:
+        raise Refusal(422, "bad_photo", str(error)) from error
+    except OutputError as error:
+        raise _not_stored(error) from error
+
+
+def record_folder(job: JobFolder) -> Path:
+    """The folder of the record that a job belongs to: of a re-check that of the first measurement."""
+    return (job.parent or job).path
+
+
+def _name_of(sha256: str, purpose: Purpose) -> str:
+    """The name of an upload: one photo may be measured and be shown with a decision too."""
+    return sha256[:32] if purpose == "measure" else hashlib.sha256(f"decide {sha256}".encode()).hexdigest()[:32]
 
 
 def check_photo(content: bytes, max_pixels: int) -> None:

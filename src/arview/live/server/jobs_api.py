@@ -7,7 +7,7 @@ import hashlib
 from collections import OrderedDict
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_args
 
 from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, Response
@@ -18,6 +18,7 @@ from arview.decisions import (
     decide_component,
     decision_document,
     decisions_csv,
+    is_attachment,
     log_of,
     sign_inspection,
     tick_step,
@@ -27,7 +28,7 @@ from arview.errors import InputError, OutputError
 from arview.live.jobs.desk import JobDesk
 from arview.live.jobs.documents import job_document, job_row, rework
 from arview.live.jobs.records import tell_report_and_history
-from arview.live.jobs.uploads import Upload, store_photo
+from arview.live.jobs.uploads import Purpose, Upload, store_attachment, store_photo
 from arview.live.security.limits import RateLimit, body, json_body
 from arview.live.security.refusals import Refusal
 from arview.live.server.hub import Hub
@@ -157,7 +158,7 @@ class JobHandlers:
         known = await asyncio.to_thread(self._desk.board.uploads(job).begin, wanted)
         if isinstance(known, str):
             return JSONResponse({"photo": known})
-        if known.offset == 0:
+        if known.offset == 0 and known.purpose == "measure":
             await asyncio.to_thread(self._desk.announced, job, known.hint)
         return JSONResponse({"upload": known.name, "offset": known.offset}, 201)
 
@@ -168,6 +169,9 @@ class JobHandlers:
         answer = await asyncio.to_thread(self._desk.board.uploads(job).state, name)
         if isinstance(answer, Upload):
             return JSONResponse({"offset": answer.offset})
+        if is_attachment(answer):
+            path = await asyncio.to_thread(_photo_file, job, answer)
+            return JSONResponse({"photo": answer, "offset": 0 if path is None else path.stat().st_size})
         photos = await asyncio.to_thread(job.photos)
         size = next((photo.bytes for photo in photos if photo.name == answer), 0)
         return JSONResponse({"photo": answer, "offset": size})
@@ -181,20 +185,26 @@ class JobHandlers:
         options = self._desk.board.options
         piece = await body(request, options.piece_bytes, options.piece_timeout_s)
         uploads = self._desk.board.uploads(job)
+        name = request.path_params["upload"]
+        before = await asyncio.to_thread(uploads.state, name)
+        is_measured = isinstance(before, Upload) and before.purpose == "measure"
         try:
-            answer = await asyncio.to_thread(uploads.add, request.path_params["upload"], int(text), piece)
+            answer = await asyncio.to_thread(uploads.add, name, int(text), piece)
         except Refusal as refusal:
-            if refusal.status == 422:
+            if refusal.status == 422 and is_measured:
                 await asyncio.to_thread(self._desk.lost, job)
             raise
-        if isinstance(answer, str):
+        if isinstance(answer, str) and not is_attachment(answer):
             await asyncio.to_thread(self._desk.changed, job)
         return _upload_response(answer)
 
     async def take(self, request: Request) -> Response:
         """Store the newest frame of a client as a photo."""
         job = await self._job(request)
-        name = (await self._json(request)).get("client")
+        wanted = await self._json(request)
+        name, purpose = wanted.get("client"), wanted.get("purpose", "measure")
+        if purpose not in get_args(Purpose):
+            raise Refusal(400, "bad_request", f"purpose: expected one of {', '.join(get_args(Purpose))}")
         client = self._hub.client(name if isinstance(name, str) else "")
         binding, tracked = client.binding, client.feed.newest
         if binding is None or binding.view.job.id != job.id:
@@ -208,6 +218,8 @@ class JobHandlers:
             image = tracked.frame.image if tracked.frame.original is None else tracked.frame.original
             content = to_jpeg(image, PHOTO_QUALITY)
             self._desk.board.space.take(len(content))
+            if purpose == "decide":
+                return store_attachment(job, content)
             photo = store_photo(job, content, hashlib.sha256(content).hexdigest(), source, hint)
             self._desk.announced(job, hint)
             self._desk.changed(job)
@@ -351,9 +363,9 @@ def _photo_file(job: JobFolder, name: str) -> Path | None:
     """File of a photo of a job, or of the photo of another of its record that a decision names; None without one."""
     if name in {photo.name for photo in job.photos()}:
         return job.path / "photos" / name
-    path = photo_path(job.path, name) if "/" in name else None
-    if path is None:
-        return None
+    path = photo_path((job.parent or job).path, name) if "/" in name else None
+    if path is None or is_attachment(name):
+        return path if path is not None and path.is_file() else None
     try:
         owner = JobFolder.open(path.parent.parent)
     except InputError:

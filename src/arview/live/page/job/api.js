@@ -15,7 +15,7 @@ export const getJob = (id) => get(at(id));
 export const getCells = (id) => get(at(id, "/capture"));
 export const endJob = (id) => post(at(id, "/end"), {});
 export const recheckJob = (id, components) => post(at(id, "/recheck"), { components });
-export const takeAtStation = (id, client) => post(at(id, "/take"), { client });
+export const takeAtStation = (id, client, purpose = "measure") => post(at(id, "/take"), { client, purpose });
 export const decide = (id, decision) => post(at(id, "/decisions"), decision);
 export const tick = (id, one) => post(at(id, "/ticks"), one);
 export const sign = (id, by, note) => post(at(id, "/sign"), { by, note });

@@ -3,6 +3,7 @@
 import { icon, make } from "../icons.js";
 import { t } from "../texts/texts.js";
 import { fileOf } from "./api.js";
+import { DecisionPhoto, titleOf } from "./decision_photo.js";
 import { latestDecisions } from "./results.js";
 import { verdictWord } from "./verdicts.js";
 
@@ -24,9 +25,12 @@ export function personField(id) {
 export class ComponentView {
   #keys = {};
 
-  /** @param events {onBack(), onRecheck(name), onTick(name, step, isDone), onDecide(decision), onTrouble(text)} */
-  constructor(events) {
-    this.events = events;
+  /**
+   * @param queue of the uploads. @param host of the page: camera, connection, state.
+   * @param events {onBack(), onRecheck(name), onTick(name, step, isDone), onDecide(decision), onTrouble(text)}
+   */
+  constructor(queue, host, events) {
+    Object.assign(this, { queue, host, events });
     this.result = make("div");
     this.decision = make("div");
     this.element = make("div", "job-view", [this.result, this.decision]);
@@ -102,7 +106,7 @@ export class ComponentView {
       const shown = make("div", "", [
         make("p", `job-decided ${decision.is_ok ? "pass" : "fail"}`, [icon(decision.is_ok ? "pass" : "fail"), make("b", "", [t(decision.is_ok ? "job.is_ok" : "job.is_not_ok", { by: decision.by })])]),
         make("p", "", [[decision.reason, decision.note].filter(Boolean).join(". ")]),
-        ...(decision.photo ? [make("img", "job-drawing", [], { src: fileOf(job.id, `photos/${decision.photo}`), alt: t("job.photo", { name: decision.photo }) })] : []),
+        ...(decision.photo ? [make("img", "job-drawing", [], { src: fileOf(job.id, `photos/${decision.photo}`), alt: t("job.photo", { name: titleOf(decision.photo) }) })] : []),
         change,
       ]);
       change.addEventListener("click", () => shown.replaceWith(this.#form(job, name)));
@@ -120,26 +124,30 @@ export class ComponentView {
     const reasons = make("datalist", "", REASONS.map((key) => make("option", "", [], { value: t(key) })), { id: "job-reasons" });
     const note = make("textarea", "", [], { id: "job-note", rows: "2", maxlength: "2000" });
     const { input: by, field } = personField("job-by");
-    const photo = make("select", "", [make("option", "", [t("job.no_photo_chosen")], { value: "" }), ...(job.photos ?? []).map((one) => make("option", "", [one], { value: one }))], { id: "job-photo" });
-    const preview = make("img", "job-drawing", [], { alt: "", hidden: "" });
-    photo.addEventListener("change", () => {
-      preview.hidden = !photo.value;
-      if (photo.value) preview.src = fileOf(job.id, `photos/${photo.value}`);
-    });
+    this.photo?.close();
+    const photo = (this.photo = new DecisionPhoto(job, this.queue, this.host, this.events.onTrouble));
+    const save = make("button", "wide primary", [t("job.save_decision")], { type: "submit" });
     const form = make("form", "job-form", [
       make("div", "job-choices", [choice("yes", "job.ok", "pass"), choice("no", "job.not_ok", "fail")], { role: "radiogroup", "aria-label": t("job.decision") }),
       make("label", "job-field", [make("span", "", [t("job.reason")]), reason], { for: "job-reason" }), reasons,
       make("label", "job-field", [make("span", "", [t("job.note")]), note], { for: "job-note" }),
-      make("label", "job-field", [make("span", "", [t("job.photo_of")]), photo], { for: "job-photo" }), preview,
-      field, make("button", "wide primary", [t("job.save_decision")], { type: "submit" }),
+      photo.element, field, save,
     ]);
-    form.addEventListener("submit", (event) => {
+    form.addEventListener("submit", async (event) => {
       event.preventDefault();
       const chosen = form.querySelector("input[name=job-ok]:checked");
       if (!chosen) return this.events.onTrouble(t("job.choose"));
       if (!by.value.trim()) return this.events.onTrouble(t("job.name_needed"));
       person.set(by.value.trim());
-      this.events.onDecide({ component: name, is_ok: chosen.value === "yes", reason: reason.value.trim(), note: note.value.trim(), by: by.value.trim(), photo: photo.value || null });
+      const said = { component: name, is_ok: chosen.value === "yes", reason: reason.value.trim(), note: note.value.trim(), by: by.value.trim() };
+      save.disabled = true;
+      try {
+        await this.events.onDecide({ ...said, photo: await photo.name() });
+      } catch (error) {
+        this.events.onTrouble(t("job.photo_refused", { why: error.message }));
+      } finally {
+        save.disabled = false;
+      }
     });
     return form;
   }

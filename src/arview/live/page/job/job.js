@@ -48,7 +48,7 @@ class JobPage {
       onComponent: (name) => this.#show("component", name), onMore: () => this.#show("capture"), onSign: () => this.#show("sign"),
       onBack: () => this.#back(), onRecheck: (id) => this.#open(id),
     });
-    this.component = new ComponentView({
+    this.component = new ComponentView(this.queue, host, {
       onBack: () => this.#show("results"), onTrouble: trouble,
       onRecheck: (name) => this.#act(async () => this.#adopt(await api.recheckJob(this.job.id, [name]))),
       onTick: (component, step, isDone) => this.#act(() => api.tick(this.job.id, { component, step, is_done: isDone, by: person.get() })),

@@ -9,7 +9,8 @@ const PIECE_BYTES = 256 * 1024; // a piece must arrive within the time limit of 
 const FIRST_PAUSE_MS = 1000, LONGEST_PAUSE_MS = 20_000, DISK_PAUSE_MS = 15_000, MAX_BAD_HASHES = 3;
 
 export class UploadQueue {
-  #entries = []; // {key, job, content, sha256, source, taken, hint, mediaType, upload, refused}
+  #entries = []; // {key, job, content, sha256, source, taken, hint, purpose, mediaType, upload, refused}
+  #awaited = new Map(); // by key: what waits for the answer of the station
   #isRunning = false;
   #wake = () => {};
   sent = 0; // bytes of the photo that is being sent
@@ -26,25 +27,32 @@ export class UploadQueue {
     return this.store?.isDurable ?? true;
   }
 
-  /** Photos of a job that the station has not confirmed yet. */
+  /** Photos of a job that are to be measured and that the station has not confirmed yet. */
   waiting(job) {
-    return this.#entries.filter((one) => one.job === job && !one.refused).length;
+    return this.#entries.filter((one) => one.job === job && one.purpose !== "decide" && !one.refused).length;
   }
 
   /** Photos of a job that the station will not take, with why. */
   refused(job) {
-    return this.#entries.filter((one) => one.job === job && one.refused);
+    return this.#entries.filter((one) => one.job === job && one.purpose !== "decide" && one.refused);
   }
 
-  /** Add a photo; resolves when it is kept on this device. */
-  async add(job, blob, { source, taken, hint }) {
+  /**
+   * Add a photo; resolves when it is kept on this device.
+   * @param purpose "measure", or "decide" for one that shows a decision.
+   * @returns {stored}: promise of its name, once the station has confirmed it.
+   */
+  async add(job, blob, { source, taken, hint, purpose = "measure" }) {
     await this.isReady;
     const content = await blob.arrayBuffer();
-    const entry = { job, content, sha256: await sha256(content), source, taken, hint, mediaType: blob.type || "image/jpeg", upload: null, refused: "" };
+    const entry = { job, content, sha256: await sha256(content), source, taken, hint, purpose, mediaType: blob.type || "image/jpeg", upload: null, refused: "" };
     entry.key = await this.store.add(entry);
     this.#entries.push(entry);
+    const stored = new Promise((resolve, reject) => this.#awaited.set(entry.key, { resolve, reject }));
+    stored.catch(() => {}); // a refusal is told by onRefused as well
     this.events.onChange();
     this.#run();
+    return { stored };
   }
 
   /** Forget a photo that the station does not take. */
@@ -90,6 +98,8 @@ export class UploadQueue {
         const name = await this.#send(entry);
         this.#say("");
         await this.#remove(entry); // only now: the station has confirmed it
+        this.#awaited.get(entry.key)?.resolve(name);
+        this.#awaited.delete(entry.key);
         this.events.onStored(entry.job, name);
         [pauseMs, badHashes] = [FIRST_PAUSE_MS, 0];
       } catch (error) {
@@ -101,6 +111,8 @@ export class UploadQueue {
         if (isFinal(error)) {
           entry.refused = error.message;
           await this.store.update(entry);
+          this.#awaited.get(entry.key)?.reject(error);
+          this.#awaited.delete(entry.key);
           this.events.onRefused(entry, error.message);
           this.events.onChange();
           continue;
@@ -118,7 +130,7 @@ export class UploadQueue {
     let offset = entry.upload ? await this.#resumed(entry) : null;
     if (offset === null) {
       const begun = await beginUpload(job, {
-        bytes: content.byteLength, sha256: entry.sha256, source: entry.source, taken: entry.taken, hint: entry.hint, media_type: entry.mediaType,
+        bytes: content.byteLength, sha256: entry.sha256, source: entry.source, taken: entry.taken, hint: entry.hint, purpose: entry.purpose ?? "measure", media_type: entry.mediaType,
       });
       if (begun.photo) return begun.photo;
       [entry.upload, offset] = [begun.upload, begun.offset];
