@@ -197,7 +197,8 @@ Job::
 
     {"id", "part": number | null, "part_name", "serial", "model_hash", "created", "camera", "parent", "components",
      "state": state.json, "is_ended", "photos": [names],
-     "attachments": [names of photos taken for decisions], "uploads": [{"upload", "bytes", "offset"}], "worker": as above,
+     "attachments": [names of photos taken for decisions], "uploads": [{"upload", "bytes", "offset"}],
+     "worker": as above,
      "faults": [texts], damaged lines of the list of photos,
      "inspection": {"created", "verdict", "sentence", "note", "components": [{"name", "verdict", "value_text",
                     "detail_text", "distance_mm", "uncertainty_mm"}]} | null,
