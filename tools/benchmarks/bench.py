@@ -28,9 +28,11 @@ from suites.cloud_cost import cloud_costs
 from suites.lenses import lens_errors
 from suites.live_latency import live_latencies
 from suites.registration import MEASURED, REFERENCE, registrations
+from suites.scaling import component_cost, photo_cost
 
 TableRow = tuple[str, str, str]
 CLOUD_POINTS = (1_000_000, 20_000_000)
+PHOTOS, COMPONENTS = (24, 48, 96), (16, 60, 200)
 MODALITIES = {"region+edge": SessionOptions(use_texture=False), "all three": SessionOptions()}
 DETECTED_FRAMES = 12
 
@@ -40,11 +42,11 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="write the figures to this file too")
     parser.add_argument(
         "--only",
-        choices=["guideviews", "track", "detect", "annotate", "register", "clouds", "lenses", "live"],
+        choices=["guideviews", "track", "detect", "annotate", "register", "clouds", "costs", "lenses", "live"],
         help="only this section",
     )
     chosen = parser.parse_args()
-    found: dict[str, Scene] = {} if chosen.only in ("register", "clouds", "lenses") else scenes()
+    found: dict[str, Scene] = {} if chosen.only in ("register", "clouds", "costs", "lenses") else scenes()
     sections = {
         "guideviews": lambda: bench_guide_views(found),
         "track": lambda: bench_tracking(found),
@@ -52,6 +54,7 @@ def main() -> None:
         "annotate": bench_annotate,
         "register": bench_registration,
         "clouds": bench_clouds,
+        "costs": bench_costs,
         "lenses": bench_lenses,
         "live": bench_live,
     }
@@ -169,6 +172,21 @@ def bench_clouds() -> tuple[dict[str, Any], list[TableRow]]:
                 f" most {1000 * one.worst_mm:.1f} um off, mean U {one.mean_u_mm:.3f} mm"
             )
             rows.append(("measure --cloud", f"sample plate, {one.points:,} points, {one.kind.upper()}", figure))
+    return figures, rows
+
+
+def bench_costs() -> tuple[dict[str, Any], list[TableRow]]:
+    """CPU time of each step and peak memory by the number of photos, and of components in a cloud."""
+    figures: dict[str, Any] = {}
+    rows: list[TableRow] = []
+    runs = [("photos", photo_cost, n, "placed") for n in PHOTOS]
+    runs += [("components in a cloud", component_cost, n, "within U") for n in COMPONENTS]
+    for what, run, count, result in runs:
+        cost = run(count)
+        figures[f"{count} {what}"] = asdict(cost)
+        steps = ", ".join(f"{name} {seconds:.1f}" for name, seconds in cost.seconds.items())
+        figure = f"{sum(cost.seconds.values()):.0f} CPU-s ({steps}), {cost.peak_mb:.0f} MB; {cost.good} {result}"
+        rows.append(("cost", f"{count} {what}", figure))
     return figures, rows
 
 

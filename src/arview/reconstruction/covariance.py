@@ -39,6 +39,8 @@ def pose_covariance(sparse: SparseModel, model: Any, adjuster: Any) -> Array | N
         for j in range(i + 1):
             block = estimate.get_cam_cross_cov_from_world(ids[photo.name], ids[sparse.photos[j].name])
             if block is not None:
+                if not np.isfinite(block).all():  # photos from one and the same place leave it singular
+                    return None
                 moved = maps[i] @ np.asarray(block) @ maps[j].T
                 joint[6 * i : 6 * i + 6, 6 * j : 6 * j + 6] = moved
                 joint[6 * j : 6 * j + 6, 6 * i : 6 * i + 6] = moved.T

@@ -155,7 +155,7 @@ def turning_center(component: Component, part: Part | None) -> Array:
     return np.asarray(through + axis * (axis @ (center - through)))
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=1024)  # more than an assembly has shapes: with fewer places each step searches anew
 def _symmetries(vertices: bytes, faces: bytes) -> tuple[Symmetry, ...]:
     """Exact symmetries of a mesh, given as the bytes of its vertices (V,3) float64 and faces (F,3) int64."""
     points, corners = np.frombuffer(vertices).reshape(-1, 3), np.frombuffer(faces, np.int64).reshape(-1, 3)
