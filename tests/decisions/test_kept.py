@@ -278,6 +278,13 @@ def test_decide_and_sign(job: Path, tmp_path: Path) -> None:
     assert len((tmp_path / "out.csv").read_text().splitlines()) == 5
 
 
+def test_a_store_that_cannot_be_used_is_told_before_signing(job: Path, tmp_path: Path) -> None:
+    (tmp_path / "garbage.sqlite").write_bytes(bytes(range(256)) * 20)
+    done = run("sign", job, "--by", "Grace", "--store", tmp_path / "garbage.sqlite")
+    assert done.exit_code == ExitCode.BAD_INPUT and "is not a results store" in done.output, done.output
+    assert not (job / "decisions.jsonl").exists()
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -138,7 +138,7 @@ def _made_folder(path: str) -> Path:
     return folder
 
 
-BY = click.option("--by", required=True, metavar="NAME", help="Who decides.")
+BY = click.option("--by", required=True, metavar="NAME", help="Who decides or signs.")
 NOTE = click.option("--note", default="", metavar="TEXT", help="Anything else.")
 
 
@@ -195,15 +195,21 @@ void.""",
 @click.option("--store", metavar="FILE|URL", help="Add inspection and decisions to this results store.")
 def sign(job: str, note: str, by: str, store: str | None) -> None:
     """Sign the inspection of JOB as it is now."""
+    from contextlib import ExitStack
+
     from arview.decisions import sign_inspection
+    from arview.decisions.folder import first_inspection, rechecks_of
 
-    sign_inspection(job, by, note)
-    is_released = _told_state(job)
-    if store is not None:
-        from arview.decisions.folder import first_inspection, rechecks_of
-        from arview.history import HistoryStore
+    with ExitStack() as stack:
+        opened = None
+        if store is not None:
+            from arview.history import HistoryStore
 
-        with HistoryStore(store) as opened:
+            first_inspection(job)  # an error of the job comes first
+            opened = stack.enter_context(HistoryStore(store))  # before a signature that cannot be taken back
+        sign_inspection(job, by, note)
+        is_released = _told_state(job)
+        if opened is not None:
             for path, _ in rechecks_of(job):
                 opened.add(path)
             added = opened.add(first_inspection(job))
