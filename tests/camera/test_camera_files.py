@@ -262,7 +262,7 @@ BAD_FILES = {
         ROS.replace("0.03]", "0.03, 1, 2, 3]").replace("cols: 5", "cols: 8"),
         "8 distortion terms, but plumb_bob",
     ),
-    "column-major": (own_json(K=[600, 0, 0, 0, 600, 0, 320, 240, 1]), "row-major"),
+    "row and column order": (own_json(K=[600, 0, 5, 0, 600, 0, 320, 240, 1]), "row-major"),
     "skew": (own_json(K=[600, 9, 320, 0, 600, 240, 0, 0, 1]), "skew 9"),
     "colmap fisheye": ("1 EUCM 640 480 1 1 1 1 0 0\n", "EUCM is not supported"),
     "colmap short": ("1 PINHOLE 640 480 600 600\n", "PINHOLE needs 4 parameters, the file gives 2"),

@@ -352,3 +352,89 @@ def test_names_that_change_nothing_are_accepted(tmp_path: Path) -> None:
              "lens": {"make": "Apple", "focal_length_mm": 4.2, "digital_zoom": 2.0},
              "calibration": {"tool": "arview 1", "uncertainty": {"fx": 1, "fy": 1, "cx": 1, "cy": 1}}}  # fmt: skip
     assert load_camera(write(tmp_path, PLAIN | extra)).fx == 1130.0
+
+
+ORB_SLAM = """\
+%YAML:1.0
+Camera.type: "KannalaBrandt8"
+Camera1.fx: 620.0
+Camera1.fy: 621.0
+Camera1.cx: 639.5
+Camera1.cy: 359.5
+Camera1.k1: -0.02
+Camera1.k2: 0.006
+Camera1.k3: -0.003
+Camera1.k4: 0.0007
+Camera.width: 1280
+Camera.height: 720
+Camera.fps: 30.0
+ORBextractor.scaleFactor: 1.2
+"""
+OST = """\
+# oST version 5.0 parameters
+
+[image]
+
+width
+1280
+
+height
+720
+
+[narrow_stereo]
+
+camera matrix
+1130.0 0.0 645.3
+0.0 1131.0 356.8
+0.0 0.0 1.0
+
+distortion
+-0.06 0.01 0.001 -0.002 0.0
+
+rectification
+1.0 0.0 0.0
+0.0 1.0 0.0
+0.0 0.0 1.0
+
+projection
+1100.0 0.0 640.0 0.0
+0.0 1100.0 360.0 0.0
+0.0 0.0 1.0 0.0
+"""
+ZED = "[{0}]\nfx=700.1\nfy=700.2\ncx=640.2\ncy=360.5\nk1=-0.17\nk2=0.02\np1=0\np2=0\nk3=0\n"
+
+
+def test_a_matrix_written_column_by_column(tmp_path: Path) -> None:
+    path = tmp_path / "open3d.json"
+    matrix = [1130.0, 0, 0, 0, 1131.0, 0, 645.3, 356.8, 1]
+    path.write_text(json.dumps({"width": 1280, "height": 720, "intrinsic_matrix": matrix}))
+    camera = load_camera(path)
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (1130.0, 1131.0, 645.3, 356.8)
+    path.write_text(json.dumps({"width": 1280, "height": 720, "K": [1130.0, 0, 5.0, 0, 1131.0, 0, 645.3, 356.8, 1]}))
+    with pytest.raises(InputError, match="row-major"):
+        load_camera(path)
+
+
+def test_settings_of_orb_slam(tmp_path: Path) -> None:
+    path = tmp_path / "orb.yaml"
+    path.write_text(ORB_SLAM)
+    camera = load_camera(path)
+    assert (camera.width, camera.height, camera.fx, camera.fy) == (1280, 720, 620.0, 621.0)
+    assert camera.lens == LensDistortion(LensModel.FISHEYE, (-0.02, 0.006, -0.003, 0.0007))
+
+
+def test_ini_files_of_ros_and_zed(tmp_path: Path) -> None:
+    path = tmp_path / "ost.txt"
+    path.write_text(OST)
+    camera = load_camera(path)
+    assert (camera.width, camera.height, camera.fx, camera.fy, camera.cy) == (1280, 720, 1130.0, 1131.0, 356.8)
+    assert camera.dist.tolist() == [-0.06, 0.01, 0.001, -0.002, 0.0]
+    path = tmp_path / "SN1234.conf"
+    path.write_text(ZED.format("LEFT_CAM_HD") + ZED.format("RIGHT_CAM_HD").replace("700.1", "701.1"))
+    with pytest.raises(InputError, match="2 different cameras"):
+        load_camera(path, 1280, 720)
+    camera = load_camera(f"{path}:RIGHT_CAM_HD", 1280, 720)
+    assert (camera.fx, camera.cx, float(camera.dist[0])) == (701.1, 640.2, -0.17)
+    path.write_text("[cam]\nfx=\nwhat\nfy=1\n")
+    with pytest.raises(InputError):
+        load_camera(path, 1280, 720)

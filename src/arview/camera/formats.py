@@ -40,6 +40,7 @@ FORMATS = (
     "JSON or nerfstudio transforms.json"
 )
 _STEREO = re.compile(r"(M|K|cameraMatrix|camera_matrix|D|distCoeffs|dist_coeffs)_?([12])")
+_ORB_SLAM = re.compile(r"(Camera\d*)\.(\w+)")
 _MAX_DEPTH = 6
 
 
@@ -82,7 +83,7 @@ def _cameras(tree: Any, label: str, depth: int) -> Iterator[tuple[str, Mapping[s
         if len(set(names)) < len(names):
             children = [(str(index), item) for index, item in enumerate(tree)]
     elif isinstance(tree, dict):
-        pair = _stereo(tree)
+        pair = _stereo(tree) or _orb_slam(tree)
         if pair:
             for name, node in pair.items():
                 yield (f"{label}/{name}" if label else name), node
@@ -136,6 +137,25 @@ def _stereo(tree: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     for key, match in pairs.items():
         both[match[2]]["D" if match[1].lower().startswith("d") else "K"] = tree[key]
     return both
+
+
+def _orb_slam(tree: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """The cameras of a map with ``Camera.fx`` or ``Camera1.fx``, as the settings of ORB-SLAM have them."""
+    groups: dict[str, dict[str, Any]] = {}
+    for key, value in tree.items():
+        match = _ORB_SLAM.fullmatch(key)
+        if match:
+            name = "camera_model" if match[2] == "type" else match[2]
+            groups.setdefault(match[1], {})[name] = value
+    common = groups.get("Camera", {})
+    found = {name: common | group for name, group in groups.items() if _is_camera(group)}
+    # Size and new size: the pictures are resized before use, the camera is that of the first size.
+    for node in found.values():
+        for name in ("fps", "RGB", "newWidth", "newHeight", "imageScale"):
+            node.pop(name, None)
+        if str(node.get("camera_model")) == "Rectified":
+            node["camera_model"] = "pinhole"
+    return found
 
 
 def _is_term(value: Any) -> bool:
@@ -291,6 +311,9 @@ def _of_matrix(key: str, matrix: list[float]) -> tuple[float, float, float, floa
         return matrix[0], matrix[1], matrix[2], matrix[3]
     if len(matrix) != 9:
         raise InputError(f"{key} has {len(matrix)} numbers; expected a matrix of 3 × 3")
+    if not any((matrix[1], matrix[2], matrix[5])) and matrix[6] > 0 and matrix[7] > 0 and matrix[8] == 1:
+        # Column by column, as Open3D, Record3D, ARKit and MATLAB write it.
+        matrix = [matrix[i] for i in (0, 3, 6, 1, 4, 7, 2, 5, 8)]
     if matrix[3] != 0 or matrix[6:] != [0, 0, 1]:
         raise InputError(f"the camera matrix {matrix} is not fx 0 cx / 0 fy cy / 0 0 1 in row-major order; correct it")
     if abs(matrix[1]) > 1e-3 * abs(matrix[0]):

@@ -31,14 +31,15 @@ TERMS = {
 }
 IGNORED = frozenset({
     # Uncertainties, other pictures and places of the camera.
-    "uncertainty", "std", "stddeviation", "covariance", "rectificationmatrix", "projectionmatrix", "r", "p",
+    "uncertainty", "std", "stddeviation", "covariance", "rectificationmatrix", "rectification", "projectionmatrix",
+    "r", "p",
     "rotationmatrix", "camrw2c", "camtw2c", "tcamimu", "tcncnm1", "timeshiftcamimu", "camoverlaps", "transformmatrix",
     "header", "extrinsics", "perviewreprojectionerrors", "extrinsicparameters", "imagepoints", "gridpoints",
     # Scales of depth and of the scene.
     "depthscale", "depthunitscalefactor", "integerdepthscale", "aabbscale", "appliedscale", "scenescale",
     # Of the calibration, not of the camera.
     "fixaspectratio", "aspectratio", "flags", "boardwidth", "boardheight", "squaresize", "markersize",
-    "cameraangley", "orientationoverride",
+    "cameraangley", "orientationoverride", "lensposition",
 })  # fmt: skip
 _SUSPICIOUS = re.compile(
     r"distort|^dist$|coef|^lens|fisheye|crop|^roi|region|offset|binn|^bin$|scal|skip|zoom|skew|^tau|^xi$|omega|^alpha$"

@@ -40,8 +40,8 @@ _KINDS = {
     _Kind.SKEWED_BROWN: ("modifiedbrownconrady",),
     _Kind.INVERSE_BROWN: ("inversebrownconrady", "inversebrown"),
     _Kind.THIN_PRISM_FISHEYE: ("thinprismfisheye",),
-    _Kind.FISHEYE: ("equidistant", "equi", "fisheye", "opencvfisheye", "kannalabrandt", "kannalabrandt4", "kb4",
-                    "simplefisheye", "simpleradialfisheye", "radialfisheye", "pinholeequi"),
+    _Kind.FISHEYE: ("equidistant", "equi", "fisheye", "opencvfisheye", "kannalabrandt", "kannalabrandt4",
+                    "kannalabrandt8", "kb4", "simplefisheye", "simpleradialfisheye", "radialfisheye", "pinholeequi"),
     _Kind.FOV: ("fov", "ftheta", "pinholefov"),
     _Kind.DIVISION: ("division", "simpledivision"),
 }  # fmt: skip

@@ -1,4 +1,4 @@
-"""The text of a camera file as trees of maps, lists, numbers and words, whether it is JSON, YAML or XML.
+"""The text of a camera file as trees of maps, lists, numbers and words, whether it is JSON, YAML, XML or INI.
 
 OpenCV's FileStorage is read in all three forms: its YAML has a header line and matrices with a tag of their own, its
 XML has lists as elements named ``_``.
@@ -25,6 +25,7 @@ MAX_BYTES = 32_000_000
 """Largest camera file; BOP and nerfstudio keep an entry for each frame in it."""
 MAX_YAML_BYTES = 4_000_000
 """Largest YAML file: its reader takes a second for each megabyte."""
+_INI_SECTION = re.compile(r"^\[[A-Za-z_]\w*\][ \t]*$", re.MULTILINE)
 _MAX_NODES = 1_000_000
 """Most values in a YAML file, whose aliases can make few bytes many values."""
 
@@ -61,6 +62,8 @@ def parse_trees(text: str) -> list[Any]:
         InputError: the text is not what its first character says it is.
     """
     try:
+        if _INI_SECTION.search(text) and not text.startswith("{"):
+            return [_from_ini(text)]
         if text.startswith(("{", "[")):
             return [_from_json(text)]
         if text.startswith("<"):
@@ -138,6 +141,32 @@ def _count_nodes(tree: Any) -> None:
             waiting.extend(node.values())
         elif isinstance(node, list):
             waiting.extend(node)
+
+
+def _from_ini(text: str) -> Any:
+    """Sections of ``name = value`` (ZED), or of a name and the lines of its numbers below it (ROS's ``ost.txt``)."""
+    sections: dict[str, Any] = {}
+    section: dict[str, Any] = {}
+    name = ""
+    for line in (raw.strip() for raw in text.splitlines()):
+        if not line or line.startswith(("#", ";")):
+            name = name if line else ""
+            continue
+        if line.startswith("[") and line.endswith("]"):
+            section = sections.setdefault(line[1:-1], {})
+            name = ""
+        elif "=" in line:
+            key, _, value = line.partition("=")
+            section[key.strip()] = _value(value)
+        elif name:
+            values = _value(line)
+            section[name] = (section[name] or []) + (values if isinstance(values, list) else [values])
+        else:
+            name = line
+            section[name] = None
+    image = sections.pop("image", {})  # of ost.txt, width and height of the other section
+    size = {key: value[0] for key, value in image.items() if isinstance(value, list) and len(value) == 1}
+    return {key: size | value for key, value in sections.items()}
 
 
 def _from_xml(text: str) -> Any:
