@@ -39,6 +39,7 @@ class _Layout:
         normal: columns of the normal, or None.
         skipped: number of lines before the first point.
         unit: declared in the header, or None.
+        declared: number of points that the header names, as PTS files do; 0 without one.
     """
 
     table: bytes
@@ -47,13 +48,15 @@ class _Layout:
     normal: tuple[int, int, int] | None
     skipped: int
     unit: str | None
+    declared: int = 0
 
 
 def read_text(path: Path, options: ReadOptions | None = None) -> RawPoints:
     """Read the points of a text file.
 
     Raises:
-        InputError: the file cannot be read, is not text, has no columns of coordinates, or too many damaged lines.
+        InputError: the file cannot be read, is not text, has no columns of coordinates, too many damaged lines, or fewer
+            lines than its header names.
     """
     o = options or ReadOptions()
     try:
@@ -89,6 +92,8 @@ def _read(path: Path, file: BinaryIO, layout: _Layout, o: ReadOptions) -> RawPoi
             )
         normals = None if layout.normal is None else values[:, layout.normal]
         collector.add(values[:, layout.point], normals)
+    if lines < layout.declared:
+        raise InputError(f"{path}: is truncated: its header names {layout.declared} points, and it has {lines} lines")
     return collector.result(layout.unit, (f"{bad} unreadable lines were left out",) if bad else ())
 
 
@@ -191,7 +196,9 @@ def _layout(path: Path, start: bytes, o: ReadOptions) -> _Layout:
         normal = _columns_of_normals(values)
     found = next((_UNIT.search(line) for line in reversed(header) if _UNIT.search(line)), None)
     unit = None if found is None else {"in": "inch"}.get(found[1].lower(), found[1].lower())
-    return _Layout(bytes(table), columns, point, normal, len(header), unit)
+    words = " ".join(header).split() if path.suffix.lower() == ".pts" else []
+    declared = int(words[0]) if len(words) == 1 and words[0].isdecimal() else 0
+    return _Layout(bytes(table), columns, point, normal, len(header), unit, declared)
 
 
 def _marks(rows: list[str]) -> str:
