@@ -501,3 +501,9 @@ def test_import_and_help_are_light() -> None:
         "assert not heavy, heavy\n"
     )
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
+
+
+def test_a_file_is_no_folder_of_jobs(room: Path) -> None:
+    (room / "jobs").write_text("mine")
+    result = run("live", "--part", "part.toml", "--jobs", "jobs")
+    assert result.exit_code == ExitCode.BAD_INPUT and "'jobs' is a file" in result.stderr

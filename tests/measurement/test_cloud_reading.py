@@ -128,7 +128,11 @@ def test_las_laz_and_e57(tmp_path: Path) -> None:
         ("c.ply", ply(count=90_000_000_000), "at most 100000000 are read"),
         ("d.ply", b"ply\nformat ascii 1.0\nelement vertex x\nend_header\n", "header is damaged"),
         ("e.pcd", pcd(5000), "is truncated"),
-        ("p.pts", b"901\n" + rows_of(POINTS).encode(), "is truncated: its header names 901 points, and it has 900 lines"),
+        (
+            "p.pts",
+            b"901\n" + rows_of(POINTS).encode(),
+            "is truncated: its header names 901 points, and it has 900 lines",
+        ),
         ("f.pcd", b"DATA\n" * 20, "is not a PCD file"),
         ("g.las", b"LASF" + b"\0" * 400, "is not a LAS file"),
         ("h.xyz", b"", "is empty"),
