@@ -170,7 +170,8 @@ seconds.""",
 @click.option("--serial", metavar="TEXT", help="Serial number of the part in view; default: that of the part file.")
 @click.option("--max-age", callback=_parse_age, default="24h", show_default=True, metavar="AGE",
               help="Age from which an inspection is called old: 8h, 3d, 90min, never.")  # fmt: skip
-@click.option("--jobs", "jobs", metavar="FOLDER", type=click.Path(file_okay=False), default="arview_jobs", show_default=True,
+@click.option("--jobs", "jobs", metavar="FOLDER", type=click.Path(file_okay=False),
+              default="arview_jobs", show_default=True,
               help="Folder of the inspections that pages start; it is made with the first one.")  # fmt: skip
 @click.option("--devices", is_flag=True, is_eager=True, expose_value=False, callback=_list_devices,
               help="List the paired phones and screens, and exit.")  # fmt: skip

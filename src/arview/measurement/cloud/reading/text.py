@@ -55,8 +55,8 @@ def read_text(path: Path, options: ReadOptions | None = None) -> RawPoints:
     """Read the points of a text file.
 
     Raises:
-        InputError: the file cannot be read, is not text, has no columns of coordinates, too many damaged lines, or fewer
-            lines than its header names.
+        InputError: the file cannot be read, is not text, has no columns of coordinates, too many damaged lines, or
+            fewer lines than its header names.
     """
     o = options or ReadOptions()
     try:
