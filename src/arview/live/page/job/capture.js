@@ -146,6 +146,11 @@ export class CaptureView {
     this.#draw();
   }
 
+  /** Whether a photo is being taken that is not yet among those that wait for the station. */
+  get isTaking() {
+    return this.#isBusy;
+  }
+
   /** Take a photo now, by itself or by a press. */
   async take(pose = this.#pose) {
     if (this.#isBusy || !this.job) return;
@@ -170,6 +175,7 @@ export class CaptureView {
       this.#isBusy = false;
       this.element.classList.remove("is-taking");
       this.#draw();
+      this.events.onTaken();
     }
   }
 

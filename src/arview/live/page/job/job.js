@@ -41,7 +41,7 @@ class JobPage {
     });
     const trouble = (text) => host.toast.show(text);
     this.capture = new CaptureView(hostOf(host, document.getElementById("job-layer")), this.queue, {
-      onEnd: () => this.#end(), onLeave: () => this.#leave(), onTrouble: trouble,
+      onEnd: () => this.#end(), onTaken: () => this.#endWhenStored(), onLeave: () => this.#leave(), onTrouble: trouble,
     });
     this.start = new StartView(host, { onStart: (part, serial) => this.#begin(part, serial), onOpen: (id) => this.#open(id) });
     this.results = new ResultsView({
@@ -117,6 +117,7 @@ class JobPage {
 
   async #endWhenStored() {
     const { job } = this;
+    if (this.capture.isTaking) return; // the photo that is being taken belongs to the job: it ends with it
     if (!job || !this.#isEnding || this.queue.waiting(job.id) || this.isEndAsked) return;
     this.isEndAsked = true;
     try {
