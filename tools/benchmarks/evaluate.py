@@ -49,6 +49,7 @@ from suites.capture import capture_rows, capture_sets
 from suites.coverage import coverage_rows
 from suites.detection import DetectionSuite
 from suites.guided_init import guided_init_rows
+from suites.identity import IdentitySuite
 from suites.measurement import measurement_rows
 from suites.occluders import OccluderSuite
 from suites.presence import PresenceSuite
@@ -67,7 +68,7 @@ SECTIONS = (
     "track", "converge", "guided-init", "detect", "semisynthetic-track", "semisynthetic-detect", "false-alarms",
     "lookalike", "relocalize", "sample", "reconstruct", "measure", "real-track", "real-detect", "quality",
     "accepted", "scale", "presence", "several", "occluders", "coverage",
-    "capture",
+    "capture", "identity",
 )  # fmt: skip
 
 
@@ -103,6 +104,10 @@ def main() -> None:
     parser.add_argument("--sets", type=Path, help="folder of make_sets.py, for coverage; default: none")
     parser.add_argument("--use", choices=("develop", "judge", "all"), default="develop", help="of --sets")
     parser.add_argument("--assemblies", type=positive, help="of presence: how many assemblies; default: all six")
+    parser.add_argument(
+        "--two-parts", type=Path,
+        help="of identity: folder with frames/, truth.json and camera.json of two castles; default: made by its script",
+    )  # fmt: skip
     chosen = parser.parse_args()
     every = scenes(SEQUENCES)
     found = {name: scene for name, scene in every.items() if name in VIDEOS}
@@ -137,6 +142,7 @@ def main() -> None:
         OccluderSuite(found, details).rows,
         lambda: coverage_rows(chosen.sets, chosen.use, chosen.folder / "coverage", details) if chosen.sets else [],
         lambda: capture_rows(capture_sets(chosen.photo_set), chosen.folder / "capture", details),
+        IdentitySuite(found, details, chosen.two_parts, chosen.folder, chosen.frames, chosen.backgrounds).rows,
     )
     sections = dict(zip(SECTIONS, makers, strict=True))
     rows: list[ResultRow] = []

@@ -28,12 +28,14 @@ from arview.evaluation.semisynthetic.random_solids import random_solid
 from arview.geometry import Array
 from arview.guideviews import GuideViewSet
 from arview.guideviews.cache import cached_guide_views
+from arview.inspection import Verdict, load_inspection
+from arview.overlay import OverlayRenderer
 from arview.pose import Pose, Presence
 from arview.rendering.renderers import ZBufferRenderer
 from arview.tracking import TrackingSession
 from arview.video.sources import open_source
 from photos import background_photos
-from recordings import ROOT, SHARED
+from recordings import ROOT, SHARED, skip
 from rows import ResultRow, watched
 from suites.detection import full_sphere_views, percent
 
@@ -128,18 +130,36 @@ class PresenceSuite:
         return [*self.case_rows(), *self.absent_rows(), *self.right_rows()]
 
     def case_rows(self) -> list[ResultRow]:
-        """The case of a panel of which only two components are there."""
+        """The case of a panel of which only two components are there, and what is drawn of the others."""
         if not (CASE / "part.toml").is_file():
+            skip("presence case", f"{CASE / 'part.toml'} is not here")
             return []
         part, camera = load_part(CASE / "part.toml"), load_camera(CASE / "three.camera.json")
+        inspection = load_inspection(CASE / "inspection.json", part.model)
         session = TrackingSession(declared_views(part), camera, part.model)
+        renderer = OverlayRenderer(part.model, camera, inspection, serial=part.serial)
         result = PresenceResult("case", there=["bolt_1", "hose_clamp"])
         names = [component.name for component in part.model.components]
         result.absent = [name for name in names[1:] if name not in result.there]
+        false_pass: list[tuple[int, str]] = []
+        labels = 0
         for number, frame in enumerate(open_source(CASE / "three.mp4")):
-            result.add(session.process(frame.image, number, number / 30.0))
-        self._details["presence-case"] = asdict(result)
-        return absent_rows("panel with two of ten", [result])
+            pose = session.process(frame.image, number, number / 30.0)
+            result.add(pose)
+            renderer.draw(frame.image, pose, now=inspection.created)
+            wanted = renderer.wanted_labels(pose)
+            texts = [] if wanted is None else [one.text for one in wanted.components]
+            labels += len(texts)
+            false_pass += [
+                (number, text.name)
+                for text in texts
+                if text.name in result.absent and text.verdict is Verdict.PASS and not text.is_dimmed
+            ]
+        self._details["presence-case"] = {**asdict(result), "false_pass": false_pass, "labels": labels}
+        frames = len({number for number, _ in false_pass})
+        text = f"{frames} of {result.frames} frames with an undimmed PASS on an absent component; {labels} labels drawn"
+        row = ResultRow("presence, drawn", "panel with two of ten", text, "0 frames", labels > 0 and not false_pass)
+        return [row, *absent_rows("panel with two of ten", [result])]
 
     def absent_rows(self) -> list[ResultRow]:
         """Assemblies of which some components are absent, walked round."""
