@@ -1,4 +1,4 @@
-"""Films of a bench on which two specimens of one part lie, with exact truth: the followed one is covered for a while."""
+"""Films of a bench on which two specimens of one part lie, with exact truth: the followed one is covered a while."""
 
 from __future__ import annotations
 
@@ -73,7 +73,9 @@ class BenchFilm:
         order = rng.permutation(len(photos))
         self._bench, self._board = (read_photo(photos[k]) for k in order[:2])
         self._phases = rng.uniform(0.0, 2.0 * np.pi, 3)
-        self._lying = [self._world_from_model(side, angle) for side, angle in zip((-1, 1), rng.uniform(-0.9, 0.9, 2))]
+        self._lying = [
+            self._world_from_model(side, angle) for side, angle in zip((-1, 1), rng.uniform(-0.9, 0.9, 2), strict=True)
+        ]
         self.truth = [tuple(self._cam_from_world(k) @ one for one in self._lying) for k in range(options.frames)]
         gone = BEFORE + SLIDE + options.hidden // 2 if options.kind == "taken away" else options.frames
         self.is_there = [k < gone for k in range(options.frames)]
