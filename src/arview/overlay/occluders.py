@@ -3,10 +3,11 @@
 The colour of the surface is learned while the part is tracked, in cells of a grid that is fixed to the model. A pixel
 whose colour differs from that of its cell, after the exposure of the frame is accounted for, or around which the ratio
 of seen to expected brightness changes abruptly, belongs to an occluder if most of its neighbours do: light and shadows
-change that ratio smoothly, the edges and highlights of a thing before the part do not. It follows the
-background subtraction of Stauffer and Grimson ("Adaptive
-background mixture models for real-time tracking", CVPR 1999), with one mode for each cell and the surface of the part
-as background. Occluders that were there before the surface was seen, or of its colour, are not found.
+change that ratio smoothly, the edges and highlights of a thing before the part do not. From there the occluder is
+extended to its outline by a watershed of that ratio, as some of it may have the colour of the surface. The comparison
+follows the background subtraction of Stauffer and Grimson ("Adaptive background mixture models for real-time tracking",
+CVPR 1999), with one mode for each cell and the surface of the part as background. Occluders that were there before the
+surface was seen, or of its colour throughout, are not found.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ _HIDDEN_SHARE = 0.6
 """Share of these pixels that an occluder of a hidden component covers."""
 _STEPS = (2, 3, 4, 6, 8, 12, 16)
 """Distances of the samples, px."""
-_BORDER_LEVEL, _BORDER = np.uint8(250), 100
+_BORDER_LEVEL, _BORDER = np.uint8(250), 125
 """Level of an occluder between whose samples and others the border is interpolated, and the level of the border."""
 _DARK = 12.0
 """Grey level of darker colours, which say nothing about the exposure."""
@@ -45,6 +46,10 @@ _MAX_CHANGE = 0.25
 _EXPOSURE_STRIDE = 5
 """Every so many samples are used for the exposure."""
 _SQUARE = np.ones((3, 3), dtype=np.uint8)
+_RATIO_OFFSET, _RATIO_LEVELS = np.float32(8.0), np.float32(120.0)
+"""Grey levels added to both colours of a ratio, which damp noise in the dark, and levels of its logarithm."""
+_SURFACE, _OCCLUDER, _BESIDE = 1, 2, 3
+"""Markers of the watershed."""
 _MIN_AGREEING = 0.1
 """Share of the samples that must agree on the exposure; with fewer it is taken to be as before."""
 
@@ -68,6 +73,10 @@ class OccluderOptions:
         min_share: share of neighbours that must look so, too.
         min_samples: samples of an occluder, at least.
         min_sure_share: share of them that must be sure.
+        reach: distance, in samples, up to which an occluder is extended to its outline.
+        min_mismatch: root mean square of the logarithm of seen to expected colour in a gap of an occluder, in standard
+            deviations of the surface, from which on the gap belongs to it: the surface between two fingers agrees.
+        min_surface_noise: the least such standard deviation.
         rate: weight of a new colour in a cell that was seen often.
         occluded_rate: the same where an occluder was found: what stays is learned in the end.
     """
@@ -86,6 +95,9 @@ class OccluderOptions:
     min_share: float = 0.6
     min_samples: int = 10
     min_sure_share: float = 0.15
+    reach: int = 6
+    min_mismatch: float = 2.5
+    min_surface_noise: float = 0.02
     rate: float = 0.04
     occluded_rate: float = 0.002
 
@@ -143,6 +155,8 @@ class OccluderFinder:
             few = compared[::_EXPOSURE_STRIDE]
             gain = self._gain = _exposure(observed.reshape(-1, 3)[few], table[cells.ravel()[few], :3], self._gain)
             strange, mask = self._occluded(cells, observed, known, gain)
+            if mask.any():
+                mask = self._to_outline(cells, observed, known, gain, strange, mask)
         if learns:
             rates = np.array([options.rate, options.occluded_rate, options.max_variance], dtype=np.float32)
             _learn(table, cells, observed, gain, mask | strange, rates)
@@ -201,6 +215,47 @@ class OccluderFinder:
         kept = (area >= options.min_samples) & (sure >= options.min_sure_share * area)
         kept[0] = False
         return is_strange.astype(np.uint8), kept[labels].astype(np.uint8)
+
+    def _to_outline(
+        self,
+        cells: NDArray[np.int64],
+        observed: NDArray[np.float32],
+        known: NDArray[np.bool_],
+        gain: NDArray[np.float32],
+        strange: NDArray[np.uint8],
+        mask: NDArray[np.uint8],
+    ) -> NDArray[np.uint8]:
+        """Samples of an occluder up to its outline, from those of its samples that look strange.
+
+        Between them and the surface around, the outline is the strongest edge of the ratio of seen to expected colour:
+        a watershed from markers (Meyer, "Color image segmentation", 1992). Gaps that agree with the surface are left
+        out.
+        """
+        options, is_part = self._options, cells >= 0
+        expected = gain * self._cells.reshape(-1, _COLUMNS)[cells, :3]
+        ratio = np.log((observed + _RATIO_OFFSET) / (expected + _RATIO_OFFSET))
+        ratio[~known] = 0.0
+        levels = np.clip(128.0 + _RATIO_LEVELS * ratio, 0.0, 255.0).astype(np.uint8)
+        side = 2 * options.reach + 1
+        near = cv2.dilate(mask, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))) > 0
+        is_strange = strange > 0
+        markers = np.where(near, 0, _SURFACE).astype(np.int32)
+        markers[(mask > 0) & is_strange] = _OCCLUDER
+        markers[~is_part] = _BESIDE
+        cv2.watershed(levels, markers)
+        found = markers == _OCCLUDER
+        # The watershed leaves a line of one sample between two regions.
+        found |= (markers < 0) & is_strange & (cv2.dilate(found.astype(np.uint8), _SQUARE) > 0)
+        mismatch = (ratio * ratio).max(axis=2)
+        around = mismatch[known & ~near]
+        noise = 1.48 * float(np.sqrt(np.median(around))) if len(around) else 0.0
+        noise = max(noise, options.min_surface_noise)
+        gaps = (found & known & ~is_strange).astype(np.uint8)
+        count, labels = cv2.connectedComponents(gaps, connectivity=4)
+        size = np.maximum(np.bincount(labels.ravel(), minlength=count), 1)
+        agrees = np.bincount(labels.ravel(), mismatch.ravel(), count) / size < (options.min_mismatch * noise) ** 2
+        agrees[0] = False
+        return (found & is_part & ~agrees[labels]).astype(np.uint8)
 
 
 class HiddenComponents:
