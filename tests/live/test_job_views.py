@@ -1,7 +1,8 @@
-"""What a client that is bound to a job is shown of a frame in which a code names another specimen."""
+"""What a client that is bound to a job is shown: labels of that job, and none where a code names another specimen."""
 
 from __future__ import annotations
 
+import itertools
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,17 +13,19 @@ import numpy as np
 from arview.cad import load_part
 from arview.geometry import look_at
 from arview.live.jobs.desk import JobDesk, JobView
+from arview.live.stream.annotator import FrameAnnotator
 from arview.live.stream.documents import pose_document
 from arview.live.stream.feed import TrackedFrame
 from arview.live.stream.frames import DecodedFrame
-from arview.live.stream.subject import Subject
+from arview.live.stream.subject import OverlayStyle, Subject
 from arview.live.stream.subjects import Subjects
 from arview.pose import Identity, Pose, TrackingState
-from helpers.live_jobs import job_options, measured, quiet_worker
+from arview.workflow.walk.records import WalkState
+from helpers.live_jobs import job_options, measured, quiet_worker, rough
 from helpers.live_sample import PART, options
 
 
-def view_of(folder: Path) -> tuple[JobView, Subjects]:
+def view_of(folder: Path, is_measured: bool = True) -> tuple[JobView, Subjects]:
     part = load_part(str(PART), None)
     chosen = options(inspection=None, jobs=job_options(folder))
     views: Any = SimpleNamespace(view_range=part.effective_view_range)
@@ -30,7 +33,8 @@ def view_of(folder: Path) -> tuple[JobView, Subjects]:
     desk = JobDesk(chosen.jobs, quiet_worker)
     desk.begin(subjects)
     job, _ = desk.start(0, "BP-0417", None)
-    measured(job)
+    if is_measured:
+        measured(job)
     return desk.view(job.id), subjects
 
 
@@ -60,3 +64,46 @@ def test_a_frame_is_made_ready_once(tmp_path: Path) -> None:
     frame = tracked(subjects)
     assert view.shown(frame) is view.shown(frame) is not frame
     assert view.shown(tracked(subjects)) is not view.shown(frame)
+
+
+def drawn_lines(view: JobView, style: OverlayStyle | None = None) -> dict[str, tuple[str, ...]]:
+    """Texts of the labels that the server draws on a picture for a client of the job, by component."""
+    frame = view.shown(tracked(view.subjects))
+    drawing = view.subject.overlay(frame.camera, style or OverlayStyle(), view.number)
+    drawing.draw(frame.frame.image, frame.poses[view.number])
+    return {label.text.name: label.lines for label in drawing.laid_out.labels}
+
+
+def test_drawn_labels_say_measuring_until_there_is_a_number(tmp_path: Path) -> None:
+    view, _ = view_of(tmp_path, is_measured=False)
+    before = drawn_lines(view)
+    assert len(before) > 5 and all(lines[:2] == (name, "measuring") for name, lines in before.items())
+    annotator = FrameAnnotator(view.subjects)
+    pictures = [annotator.draw(view.shown(tracked(view.subjects))).image]
+    # First numbers, of two components only.
+    rough(view.job, ["post_1", "post_2"])
+    assert view.subject.reload()
+    first = drawn_lines(view)
+    assert first["post_1"][1].endswith(" mm") and "measuring" not in first["post_1"]
+    assert "measuring" in first["nut_1"] and first["nut_1"] == before["nut_1"]
+    pictures.append(annotator.draw(view.shown(tracked(view.subjects))).image)
+    # Of the only component that is drawn.
+    assert set(drawn_lines(view, OverlayStyle(only="nut_1"))) == {"nut_1"}
+    measured(view.job)
+    assert view.subject.reload()
+    after = drawn_lines(view)
+    assert len(after) > 5 and not any("measuring" in lines for lines in after.values())
+    pictures.append(annotator.draw(view.shown(tracked(view.subjects))).image)
+    assert all(np.abs(a.astype(int) - b).max() > 50 for a, b in itertools.pairwise(pictures))
+
+
+def test_only_what_a_recheck_measures_says_measuring(tmp_path: Path) -> None:
+    view, subjects = view_of(tmp_path)
+    desk = JobDesk(subjects.options.jobs, quiet_worker)
+    desk.begin(subjects)
+    again = desk.view(desk.board.recheck(view.job, ["post_1"]).id)
+    lines = drawn_lines(again)
+    assert [name for name, texts in lines.items() if "measuring" in texts] == ["post_1"]
+    assert lines["post_2"] == drawn_lines(view)["post_2"]
+    again.job.write_state(WalkState("failed", "no photo could be placed", 0, 0))
+    assert again.subject.reload() and not any("measuring" in texts for texts in drawn_lines(again).values())

@@ -218,7 +218,7 @@ Part::
      "components": [{"name", "color": "#rrggbb", "anchor_in_model": [3], "rank": by urgency | null,
                      "verdict": "pass" | "fail" | "undecided" | "measured" | "not_measured" | null, null: not inspected,
                      "verdict_text": "PASS" | null, "verdict_color": "#rrggbb", "missing": bool,
-                     "value_text": "measuring" while a job has no number, "detail_text",
+                     "value_text": "measuring" while a job has no number, then "is_pending" is true, "detail_text",
                      "distance_mm" | null, "uncertainty_mm" | null, "tolerance_mm" | null,
                      "displacement_mm": [3, null where undetermined]}],
      "inspection": {"part", "serial", "created": ISO 8601 UTC, "age_s", "note", "method"} | null,

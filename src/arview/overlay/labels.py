@@ -7,7 +7,7 @@ no number of the inspection.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from datetime import datetime
 from functools import cached_property
@@ -28,6 +28,8 @@ CHANGED = "changed since measured"
 UNVERIFIED = "not verified here"
 UNCERTAIN = "evidence here conflicts"
 OCCLUDED = "hidden by something"
+MEASURING = "measuring"
+"""What stands in place of a value that is not there yet."""
 _SECONDS_PER_DAY = 86400.0
 _MIN_TURN_DEG = 5.0
 """Rotation of a displaced component below which its label does not tell it."""
@@ -61,6 +63,21 @@ def by_urgency(inspection: Inspection) -> list[ComponentDeviation]:
         return _RANK[deviation.verdict], -excess, deviation.name
 
     return sorted(inspection.components, key=key)
+
+
+def label_order(names: Iterable[str], inspection: Inspection | None, pending: Collection[str] = ()) -> list[str]:
+    """Components with something to tell, by urgency; those that are measured now follow the failed ones.
+
+    Args:
+        names: of the components of the model.
+        inspection: what was measured, if anything.
+        pending: names of the components that are being measured.
+    """
+    measured = by_urgency(inspection) if inspection else []
+    known = {one.name for one in measured}
+    urgent = [one.name for one in measured if one.verdict in (Verdict.FAIL, Verdict.UNDECIDED)]
+    open_names = [name for name in names if name in pending and name not in known]
+    return [*urgent, *open_names, *(one.name for one in measured if one.name not in urgent)]
 
 
 def value_text(deviation: ComponentDeviation, options: OverlayOptions) -> str:
@@ -189,6 +206,7 @@ def label_text(
     is_withheld: bool = False,
     doubt: str = "",
     note: str = "",
+    is_pending: bool = False,
 ) -> LabelText:
     """Texts of a component's label, for the picture and for the page.
 
@@ -201,6 +219,7 @@ def label_text(
         is_withheld: the labels of a serial number must not be shown with this pose.
         doubt: from `inspection_doubt`.
         note: a further remark, e.g. that the place depends on which pose is right.
+        is_pending: the component is being measured: `MEASURING` stands in place of the value.
     """
     evidence = evidence_of(presence, is_withheld)
     if evidence is DrawnEvidence.WITHHELD:
@@ -209,7 +228,8 @@ def label_text(
     was_measured = deviation is not None and deviation.distance_mm is not None
     if evidence is DrawnEvidence.MISSING:
         notes = _with((), CHANGED if was_measured else "as measured" if was_missing else "")
-        return LabelText(name, "", "MISSING", _with(notes, note), evidence=evidence)
+        value = MEASURING if is_pending else ""
+        return LabelText(name, value, "MISSING", _with(notes, note), evidence=evidence)
     if evidence is DrawnEvidence.DISPLACED:
         assert presence is not None
         away, turned = displacement_texts(presence, center_in_model, options)
@@ -217,8 +237,10 @@ def label_text(
         notes = _with(turned, CHANGED if is_new else "", note)
         return LabelText(name, away, "DISPLACED", notes, evidence=evidence)
     if deviation is None:
-        word = {DrawnEvidence.UNVERIFIED: "NOT VERIFIED", DrawnEvidence.UNCERTAIN: "UNCERTAIN"}.get(evidence, "SEEN")
-        return LabelText(name, "", word, _with((), note), evidence=evidence, is_dimmed=evidence.is_open)
+        seen = "" if is_pending else "SEEN"
+        word = {DrawnEvidence.UNVERIFIED: "NOT VERIFIED", DrawnEvidence.UNCERTAIN: "UNCERTAIN"}.get(evidence, seen)
+        value = MEASURING if is_pending else ""
+        return LabelText(name, value, word, _with((), note), evidence=evidence, is_dimmed=evidence.is_open)
     value, word, verdict = value_text(deviation, options), VERDICT_WORD[deviation.verdict], deviation.verdict
     is_measured = verdict is not Verdict.NOT_MEASURED
     remark = ""
@@ -266,10 +288,13 @@ def _with(notes: tuple[str, ...], *more: str) -> tuple[str, ...]:
 
 
 def text_urgency(
-    names: tuple[str, ...], inspection: Inspection | None, evidence: Mapping[str, DrawnEvidence]
+    names: tuple[str, ...],
+    inspection: Inspection | None,
+    evidence: Mapping[str, DrawnEvidence],
+    pending: Collection[str] = (),
 ) -> list[str]:
-    """Components that deserve a label, the most urgent first: missing or displaced ones, then by `by_urgency`."""
-    measured = [deviation.name for deviation in by_urgency(inspection)] if inspection else []
+    """Components that deserve a label, the most urgent first: missing or displaced ones, then by `label_order`."""
+    measured = label_order(names, inspection, pending)
     refuted = [name for name in names if evidence[name].is_refuted]
     rank = {name: index for index, name in enumerate(measured)}
     refuted.sort(key=lambda name: (evidence[name] is DrawnEvidence.DISPLACED, rank.get(name, len(rank)), name))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from datetime import datetime
 from types import NoneType
@@ -94,8 +95,15 @@ class OverlayRenderer:
         options: OverlayOptions | None = None,
         *,
         serial: str | None = None,
+        pending: Collection[str] = (),
     ) -> None:
-        """Prepare the drawing; ``serial`` is the serial number of the part in view, where it is known."""
+        """Prepare the drawing.
+
+        Args:
+            model, camera, inspection, options: what is drawn, and how.
+            serial: serial number of the part in view, where it is known.
+            pending: names of the components that are being measured: without a value, their labels say so.
+        """
         check_type(model, Model, "OverlayRenderer: model")
         check_type(camera, Camera, "OverlayRenderer: camera")
         check_type(inspection, (Inspection, NoneType), "OverlayRenderer: inspection")
@@ -118,6 +126,8 @@ class OverlayRenderer:
         self._arrow_scale = labels.arrow_scale(inspection, model.diameter_mm, self.options) if inspection else 1.0
         self._names = tuple(component.name for component in model.components)
         self._deviations = [inspection.find(name) if inspection else None for name in self._names]
+        found = zip(self._names, self._deviations, strict=True)
+        self._pending = frozenset(name for name, one in found if one is None and name in pending)
         self._status = self._make_status()
         bottom_px = camera.height - (self._status.height_px if self.options.show_status else 0)
         self._annotations = self._make_annotations(bottom_px)
@@ -259,7 +269,7 @@ class OverlayRenderer:
         return StatusLine(
             self.camera.width, self.camera.height, round(0.95 * self._size_px), self.inspection,
             self._arrow_scale if self.options.show_arrows and len(arrows) else None,
-            len(self._names) > 1 and self.options.show_evidence,
+            len(self._names) > 1 and self.options.show_evidence, bool(self._pending),
         )  # fmt: skip
 
     def _make_annotations(self, bottom_px: int) -> Annotations:
@@ -268,6 +278,9 @@ class OverlayRenderer:
             for deviation in self._deviations
             if deviation is not None and self.options.show_labels
         ]
+        if self.options.show_labels:
+            pending = sorted(self._pending)
+            texts += [labels.label_text(name, None, None, self.options, is_pending=True) for name in pending]
         return Annotations(self.camera, self._size_px, texts, self.options.max_labels, bottom_px)
 
     def _presences(self, pose: Pose) -> list[ComponentPresence | None]:
@@ -286,7 +299,7 @@ class OverlayRenderer:
             styles = component_styles(self.model, self.inspection, self.options, evidence, bool(doubt))
             by_name = dict(zip(self._names, evidence, strict=True))
             index = {name: number for number, name in enumerate(self._names)}
-            wanted = labels.text_urgency(self._names, self.inspection, by_name)
+            wanted = labels.text_urgency(self._names, self.inspection, by_name, self._pending)
             order = tuple(index[name] for name in wanted) if self.options.show_labels and not is_withheld else ()
             arrows = self._arrows_in_model(list(evidence)) if self.options.show_arrows else np.zeros((0, 2, 3))
             self._scene = _PartLook(key, evidence, styles, order, arrows, {})
@@ -366,6 +379,7 @@ class OverlayRenderer:
                 center_in_model=self._centers_in_model[index],
                 doubt=scene.key[1],
                 note=note,
+                is_pending=self._names[index] in self._pending,
             )
             scene.texts[index, note] = text
         return text

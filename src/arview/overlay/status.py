@@ -9,6 +9,7 @@ from datetime import UTC, datetime
 
 from arview.inspection import Inspection, Verdict
 from arview.overlay import paint
+from arview.overlay.labels import MEASURING
 from arview.overlay.options import VERDICT_RGB, VERDICT_WORD, Rgb
 from arview.pose import Completeness, Pose, Presence, TrackingState
 
@@ -67,11 +68,14 @@ class StatusLine:
         inspection: Inspection | None,
         scale: float | None,
         with_completeness: bool = False,
+        is_measuring: bool = False,
     ) -> None:
-        """``with_completeness`` keeps room for the completeness of a part of several components."""
+        """``with_completeness`` keeps room for the completeness of a part of several components; ``is_measuring`` says
+        that values of the part are still to come.
+        """
         self._width, self._size = width, size_px
         self.bottom_px = height
-        self._inspection, self._scale = inspection, scale
+        self._inspection, self._scale, self._is_measuring = inspection, scale, is_measuring
         self._row_px = round(1.75 * size_px)
         self._pad = round(0.7 * size_px)
         self._fixed = self._inspection_items(None)
@@ -153,7 +157,7 @@ class StatusLine:
     def _inspection_items(self, now: datetime | None, is_withheld: bool = False) -> list[tuple[str, Rgb]]:
         inspection = self._inspection
         if inspection is None:
-            return [("no inspection", _MUTED)]
+            return [(MEASURING if self._is_measuring else "no inspection", _MUTED)]
         serial = f"  {inspection.serial}" if inspection.serial else ""
         room = round(0.3 * self._width) - paint.text_width(serial, self._size)
         title = paint.shortened(inspection.part, self._size, max(room, _MIN_PART * self._size))
@@ -166,6 +170,8 @@ class StatusLine:
             for verdict in _COUNT_ORDER
             if verdict in verdicts
         ]
+        if self._is_measuring:
+            items.append((MEASURING, _MUTED))
         if now is not None:
             items.append((f"inspected {age_text(inspection.age_s(now))}", _MUTED))
         if self._scale is not None:

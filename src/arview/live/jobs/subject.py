@@ -18,8 +18,6 @@ from arview.workflow.walk.records import WalkState
 
 logger = logging.getLogger("arview.live")
 
-MEASURING = "measuring"
-"""What stands in place of a value that is not there yet."""
 _REVISIONS = itertools.count(1 << 20)
 """Revisions of all jobs: none is that of another job, or of a part without one."""
 
@@ -58,11 +56,11 @@ class JobSubject(Subject):
         """Read state and inspection of the job again; returns whether something else is shown now."""
         state = self.job.state()
         shown = self._merged(state)
-        pending_text = MEASURING if is_open(state) else ""
+        pending = self._being_measured() if is_open(state) else frozenset[str]()
         faults = self.job.faults()
         with self._lock:
-            is_new = (shown, pending_text) != (self._shown, self.pending_text)
-            self.state, self._shown, self.pending_text, self._faults = state, shown, pending_text, faults
+            is_new = (shown, pending) != (self._shown, self.pending)
+            self.state, self._shown, self.pending, self._faults = state, shown, pending, faults
             if is_new:
                 self.revision = next(_REVISIONS)
         return is_new
@@ -79,6 +77,11 @@ class JobSubject(Subject):
         if shown is not None and state.stage == "done":
             notices += age_notices(shown, self.options.max_age_s)
         return notices
+
+    def _being_measured(self) -> frozenset[str]:
+        """Names of the components that the job measures: all of them, but of a re-check those that it is about."""
+        checked = self.job.components
+        return frozenset(one.name for one in self.part.model.components) if checked is None else frozenset(checked)
 
     def _merged(self, state: WalkState) -> Inspection | None:
         """What is shown: of an unfinished job only components with a number, else the newest value of each."""

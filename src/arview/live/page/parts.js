@@ -140,10 +140,10 @@ class PartList {
   #state(one) {
     if (this.withheld) return { kind: "none", value: "", u: null, word: t("parts.withheld"), notes: [] };
     const seen = this.seen.get(one.name);
-    const plain = { kind: one.verdict ?? "none", value: one.value_text || (one.missing ? t("parts.missing") : "–"), u: one.uncertainty_mm, word: one.verdict ? t(`verdict.${one.verdict}`) : one.verdict_text ?? t("parts.no_verdict"), notes: [] };
+    const plain = { kind: one.verdict ?? "none", value: one.is_pending ? t("parts.measuring") : one.value_text || (one.missing ? t("parts.missing") : "–"), u: one.uncertainty_mm, word: one.verdict ? t(`verdict.${one.verdict}`) : one.verdict_text ?? (one.is_pending ? "" : t("parts.no_verdict")), notes: [] };
     if (!seen || (one.verdict === null && seen.is_dimmed)) return plain;
     if (!["missing", "displaced"].includes(seen.evidence)) return { ...plain, kind: `${plain.kind}${seen.is_dimmed ? " dimmed" : ""}`, notes: seen.notes };
-    return { kind: seen.evidence, value: seen.value, u: null, word: seen.word, notes: seen.notes };
+    return { kind: seen.evidence, value: one.is_pending && seen.evidence === "missing" ? "" : seen.value, u: null, word: seen.word, notes: seen.notes };
   }
 
   /** Mark the isolated component; null for none. */
@@ -173,7 +173,7 @@ class PartList {
     const shown = make("span", "value", [value]);
     if (u !== null) shown.append(make("small", "", [`U ${rounded(u, u)}`]));
     const row = make("button", kind, [
-      icon(kind.split(" ")[0]), make("span", "name", [one.name]), shown, make("span", "verdict", [[word, ...notes].join(", ")]),
+      icon(kind.split(" ")[0]), make("span", "name", [one.name]), shown, make("span", "verdict", [[word, ...notes].filter(Boolean).join(", ")]),
     ], { "aria-pressed": "false" });
     row.dataset.name = one.name;
     row.addEventListener("click", () => this.onPick(this.only === one.name ? null : one.name));
@@ -198,7 +198,7 @@ class PartList {
     if (this.withheld) return [head, make("p", "rest", [this.withheld.text])];
     if (["missing", "displaced"].includes(kind)) return [head, make("p", "big", [value || t("parts.missing")]), ...remark];
     if (one.distance_mm === null) {
-      return [head, make("p", "big", [one.value_text || t(one.verdict ? "card.not_measured" : "card.not_inspected")])];
+      return [head, make("p", "big", [one.is_pending ? t("parts.measuring") : one.value_text || t(one.verdict ? "card.not_measured" : "card.not_inspected")])];
     }
     const u = one.uncertainty_mm ?? 0;
     const numbers = make("p", "numbers", [

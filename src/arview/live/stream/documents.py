@@ -14,7 +14,15 @@ from arview.live.stream.notices import Notice
 from arview.live.stream.subject import OverlayStyle, Subject
 from arview.live.stream.subjects import Subjects
 from arview.overlay.evidence import DrawnEvidence, evidence_of, presence_of
-from arview.overlay.labels import arrow_scale, by_urgency, detail_text, inspection_doubt, label_text, value_text
+from arview.overlay.labels import (
+    MEASURING,
+    arrow_scale,
+    detail_text,
+    inspection_doubt,
+    label_order,
+    label_text,
+    value_text,
+)
 from arview.overlay.legend import legend_entries, withheld_title
 from arview.overlay.mesh import anchor_in_model, topology
 from arview.overlay.options import VERDICT_RGB, VERDICT_WORD, OverlayOptions
@@ -92,14 +100,15 @@ def evidence_document(pose: Pose, subject: Subject | None) -> Document:
             continue
         center = component.bounds_in_model.mean(axis=0)
         text = label_text(
-            component.name, deviation, presence, options, center_in_model=center, doubt=doubt
+            component.name, deviation, presence, options, center_in_model=center, doubt=doubt,
+            is_pending=component.name in subject.pending,
         )  # fmt: skip
         moved = None if presence is None else presence.model_from_nominal
         document["labels"].append(
             {
                 "index": index,
                 "evidence": str(evidence),
-                "value": text.value or (subject.pending_text if deviation is None else ""),
+                "value": text.value,
                 "word": text.word,
                 "notes": list(text.notes),
                 "color": _hex(text.rgb),
@@ -177,7 +186,8 @@ def with_ages(document: Document, subjects: Subjects) -> Document:
 def part_document(subject: Subject) -> Document:
     """What *Part* says of one part."""
     model, inspection = subject.part.model, subject.inspection
-    ranks = {one.name: rank for rank, one in enumerate(by_urgency(inspection))} if inspection else {}
+    order = label_order([one.name for one in model.components], inspection, subject.pending)
+    ranks = {name: rank for rank, name in enumerate(order)}
     components = []
     for component in model.components:
         found = inspection.find(component.name) if inspection else None
@@ -187,7 +197,7 @@ def part_document(subject: Subject) -> Document:
                 "color": _hex(tuple(round(255 * value) for value in component.color)),
                 "anchor_in_model": anchor_in_model(component, topology(component)).tolist(),
                 "rank": ranks.get(component.name),
-                **_deviation_document(found, subject.pending_text),
+                **_deviation_document(found, component.name in subject.pending),
             }
         )
     return {
@@ -242,11 +252,12 @@ def style_document(style: OverlayStyle) -> Document:
     }
 
 
-def _deviation_document(found: ComponentDeviation | None, pending_text: str = "") -> Document:
+def _deviation_document(found: ComponentDeviation | None, is_pending: bool = False) -> Document:
     if found is None:
         names = ("verdict", "verdict_text", "verdict_color", "distance_mm", "uncertainty_mm", "tolerance_mm")
-        empty = {"displacement_mm": None, "missing": False, "value_text": pending_text, "detail_text": ""}
-        return {**dict.fromkeys(names), **empty}
+        value = MEASURING if is_pending else ""
+        empty = {"displacement_mm": None, "missing": False, "value_text": value, "detail_text": ""}
+        return {**dict.fromkeys(names), **empty, "is_pending": is_pending}
     plain = OverlayOptions()
     return {
         "verdict": str(found.verdict),
@@ -259,6 +270,7 @@ def _deviation_document(found: ComponentDeviation | None, pending_text: str = ""
         "missing": found.finding is Finding.MISSING,
         "value_text": value_text(found, plain),
         "detail_text": detail_text(found, plain),
+        "is_pending": False,
     }
 
 

@@ -72,7 +72,7 @@ class Subject:
     Attributes:
         serial: serial number of the part at the station, or None.
         revision: number of the part document, increased with each new inspection.
-        pending_text: what stands in place of a value that is still being measured; empty where nothing is.
+        pending: names of the components that are being measured: those without a value say so.
 
     Raises:
         InputError, MismatchError: the inspection cannot be read or belongs to another model, or the guide view does
@@ -98,7 +98,7 @@ class Subject:
         if options.guide is not None:
             guide_pose(options.guide, part, views.view_range, guess_camera(options.width, options.height))
 
-    pending_text = ""
+    pending: frozenset[str] = frozenset()
 
     @cached_property
     def label_options(self) -> OverlayOptions:
@@ -159,10 +159,16 @@ class Subject:
 
     def overlay(self, camera: Camera, style: OverlayStyle, number: int = 0) -> OverlayRenderer:
         """A renderer of the overlay for a feed with this camera; ``number`` is that of this part."""
+        with self._lock:
+            pending = self.pending
         inspection = self.inspection
-        if inspection is not None and style.only is not None:
+        measured = {one.name for one in inspection.components} if inspection else set()
+        pending -= measured
+        if style.only is not None:
             is_of_it = number == style.only_part
-            wanted = tuple(one for one in inspection.components if is_of_it and one.name == style.only)
-            inspection = replace(inspection, components=wanted)
+            pending &= {style.only} if is_of_it else set()
+            if inspection is not None:
+                wanted = tuple(one for one in inspection.components if is_of_it and one.name == style.only)
+                inspection = replace(inspection, components=wanted)
         options = replace(style.overlay_options(), max_age_days=self.label_options.max_age_days)
-        return OverlayRenderer(self.part.model, camera, inspection, options, serial=self.serial)
+        return OverlayRenderer(self.part.model, camera, inspection, options, serial=self.serial, pending=pending)

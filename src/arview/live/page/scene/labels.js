@@ -211,7 +211,8 @@ export class Labels {
     label.key = key;
     label.width = 0;
     const kind = REFUTED.includes(seen?.evidence) ? seen.evidence : component.verdict ?? "none";
-    const value = seen ? seen.value : component.value_text || (component.missing ? t("parts.missing") : "");
+    const isPending = component.is_pending && seen?.evidence !== "displaced";
+    const value = isPending ? t("parts.measuring") : seen ? seen.value : component.value_text || (component.missing ? t("parts.missing") : "");
     const u = kind === component.verdict ? component.uncertainty_mm : null;
     const detail = seen ? seen.notes.join(", ") : component.verdict !== "pass" ? component.detail_text : "";
     const what = [make("span", "verdict", [seen?.word ?? (component.verdict ? t(`verdict.${component.verdict}`) : component.verdict_text ?? "")])];

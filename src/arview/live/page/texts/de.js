@@ -110,6 +110,7 @@ export default {
   "parts.inspected": "Geprüft {age}",
   "parts.inspected_by": "Geprüft {age}, {method}",
   "parts.not_inspected": "Noch nicht geprüft",
+  "parts.measuring": "wird gemessen",
   "parts.no_verdict": "nicht geprüft",
   "parts.withheld": "zurückgehalten",
   "parts.missing": "fehlt",

@@ -110,6 +110,7 @@ export default {
   "parts.inspected": "Inspected {age}",
   "parts.inspected_by": "Inspected {age}, {method}",
   "parts.not_inspected": "Not inspected yet",
+  "parts.measuring": "measuring",
   "parts.no_verdict": "not inspected",
   "parts.withheld": "withheld",
   "parts.missing": "missing",
