@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from arview.core.messages import Message
+
 RingDistance = Literal["near", "good", "far"]
 """Distance of the camera: nearer than the ring of good distances, on it, or farther."""
 
@@ -35,7 +37,7 @@ class ComponentNeed:
         directions: of these that differ.
         predicted_u_mm: expanded uncertainty (k = 2) to be expected from them; None with fewer than two.
         is_enough: whether nothing more is asked for.
-        text: what is lacking, or empty.
+        lacking: what is lacking, if anything.
     """
 
     name: str
@@ -43,7 +45,12 @@ class ComponentNeed:
     directions: int
     predicted_u_mm: float | None
     is_enough: bool
-    text: str = ""
+    lacking: Message | None = None
+
+    @property
+    def text(self) -> str:
+        """What is lacking, in English, or empty."""
+        return "" if self.lacking is None else self.lacking.text
 
 
 @dataclass(frozen=True)
@@ -53,8 +60,8 @@ class CaptureAdvice:
     Attributes:
         takes: take a photo now; stays true until the photo is reported as taken or failed.
         take_id: grows with each photo that is asked for, so that none is taken twice.
-        text: where to go next.
-        reason: why no photo is taken at this frame; empty when one is.
+        way: where to go next.
+        obstacle: why no photo is taken at this frame; None when one is.
         progress: 0–1.
         is_enough: whether the photos suffice.
         photos: taken so far.
@@ -66,8 +73,8 @@ class CaptureAdvice:
 
     takes: bool
     take_id: int
-    text: str
-    reason: str
+    way: Message
+    obstacle: Message | None
     progress: float
     is_enough: bool
     photos: int
@@ -75,6 +82,22 @@ class CaptureAdvice:
     distance: RingDistance
     components: tuple[ComponentNeed, ...]
     revision: int = 0
+
+    @property
+    def text(self) -> str:
+        """Where to go next, in English."""
+        return self.way.text
+
+    @property
+    def reason(self) -> str:
+        """Why no photo is taken at this frame, in English; empty when one is."""
+        return "" if self.obstacle is None else self.obstacle.text
+
+    def messages(self, has_components: bool = True) -> dict[str, dict[str, Any]]:
+        """Key and values of each text, by the text, for pages in other languages."""
+        needs = [one.lacking for one in self.components] if has_components else []
+        said = [one for one in (self.way, self.obstacle, *needs) if one is not None]
+        return {one.text: one.document() for one in said}
 
 
 def capture_document(advice: CaptureAdvice, job: str = "", has_components: bool = True) -> dict[str, Any]:
@@ -108,4 +131,5 @@ def capture_document(advice: CaptureAdvice, job: str = "", has_components: bool 
             }
             for index, one in enumerate(advice.components)
         ]
+    document["messages"] = advice.messages(has_components)
     return document

@@ -17,6 +17,7 @@ from arview.capture.needs import CaptureNeeds
 from arview.capture.options import CaptureOptions
 from arview.capture.trigger import FocusMonitor, Hysteresis, MotionMonitor, middle_of_part
 from arview.core.checks import check_type
+from arview.core.messages import Message
 from arview.geometry import Array, apply, check_rigid
 from arview.pose import Pose, TrackingState
 from arview.reconstruction.coverage import unit
@@ -86,8 +87,8 @@ class CaptureGuide:
         """
         if self._asked is not None and not 0.0 <= time_s - self._asked[0] <= self.options.trigger.pending_s:
             self.photo_failed()
-        reason = self._obstacle(pose, image_rgb, time_s, gyro_rad_s)
-        if not reason and pose.cam_from_model is not None:
+        obstacle = self._obstacle(pose, image_rgb, time_s, gyro_rad_s)
+        if obstacle is None and pose.cam_from_model is not None:
             self._take_id += 1
             self._asked = time_s, pose.cam_from_model
         takes = self._asked is not None
@@ -95,8 +96,8 @@ class CaptureGuide:
         return CaptureAdvice(
             takes=takes,
             take_id=self._take_id,
-            text=self._text(here),
-            reason=reason,
+            way=self._way(here),
+            obstacle=obstacle,
             progress=self.needs.progress,
             is_enough=self.needs.is_enough,
             photos=self.needs.photos,
@@ -128,44 +129,44 @@ class CaptureGuide:
 
     def _obstacle(
         self, pose: Pose, image_rgb: NDArray[np.uint8] | None, time_s: float, gyro_rad_s: float | None
-    ) -> str:
-        """Why no photo is to be taken at this frame; empty if nothing stands against it."""
+    ) -> Message | None:
+        """Why no photo is to be taken at this frame; None if nothing stands against it."""
         trigger = self.options.trigger
         here = pose.cam_from_model
         is_certain = self._quality.update(pose.quality if here is not None else 0.0)
         if here is None:
             self._motion.forget()
-            return words.NOT_TRACKED
+            return words.NOT_TRACKED()
         is_still = self._motion.update(here, time_s, gyro_rad_s)
         self._distance = self._ring_distance(here)
         pixels = self._camera.project(apply(here, self._corners))
         gray = None if image_rgb is None else middle_of_part(image_rgb, pixels, trigger.focus_px)
         is_sharp = gray is None or self._focus.update(gray, time_s)
         if self._asked is not None:
-            return words.TAKING
+            return words.TAKING()
         if self.needs.is_enough:
-            return words.ENOUGH
+            return words.ENOUGH()
         if pose.state is not TrackingState.TRACKED or not is_certain:
-            return words.NOT_TRACKED if pose.state is not TrackingState.CRITICAL else words.UNCERTAIN
+            return words.NOT_TRACKED() if pose.state is not TrackingState.CRITICAL else words.UNCERTAIN()
         if pose.is_label_withheld:
-            return words.OTHER_SPECIMEN
+            return words.OTHER_SPECIMEN()
         if pose.alternatives:
-            return words.AMBIGUOUS
+            return words.AMBIGUOUS()
         if self._distance != "good":
-            return words.CLOSER if self._distance == "far" else words.FARTHER
+            return words.CLOSER() if self._distance == "far" else words.FARTHER()
         if self._inside_share(pixels) < trigger.min_inside:
-            return words.NOT_INSIDE
+            return words.NOT_INSIDE()
         if self.needs.nearest_deg(self._direction(here)) < self.needs.apart_deg:
-            return words.ALREADY_TAKEN
+            return words.ALREADY_TAKEN()
         if not self._gains_enough(here, time_s):
-            return words.LITTLE_GAIN
+            return words.LITTLE_GAIN()
         if not is_still:
-            return words.HOLD_STILL
+            return words.HOLD_STILL()
         if not is_sharp:
-            return words.NOT_SHARP
+            return words.NOT_SHARP()
         if self._last_s is not None and 0.0 <= time_s - self._last_s < trigger.min_interval_s:
-            return words.TOO_SOON
-        return "" if gray is None or self._focus.is_in_focus(gray) else words.OUT_OF_FOCUS
+            return words.TOO_SOON()
+        return None if gray is None or self._focus.is_in_focus(gray) else words.OUT_OF_FOCUS()
 
     def _gains_enough(self, cam_from_model: Array, time_s: float) -> bool:
         """Whether a photo from here lowers U nearly as much as one from the best direction.
@@ -205,18 +206,19 @@ class CaptureGuide:
         """The cell of the dome nearest to the camera."""
         return self.dome.nearest(self._direction(cam_from_model))
 
-    def _text(self, here: Array | None) -> str:
+    def _way(self, here: Array | None) -> Message:
         """Where to go next."""
         if self.needs.is_enough:
-            return f"{words.ENOUGH}: {self.needs.photos}"
+            return words.ENOUGH_OF(count=self.needs.photos)
         plan = self.needs.plan
         if here is None:
-            return words.more_text(len(plan), ())
+            return words.more_message(len(plan), ())
         distance_mm = float(np.linalg.norm(apply(here, self._center)))
         eyes = self._center + distance_mm * self.dome.directions[plan]
         sides = [words.side_of(here, eye, self._center) for eye in eyes]
-        hidden = words.hidden_text(self.needs.hidden_from(self._cell(here)))
-        return "; ".join(text for text in (words.more_text(len(plan), sides), hidden) if text)
+        more = words.more_message(len(plan), sides)
+        hidden = words.hidden_message(self.needs.hidden_from(self._cell(here)))
+        return more if hidden is None else words.BOTH(first=more, second=hidden)
 
     def _cell_states(self) -> tuple[CellState, ...]:
         """The cells of the dome, made anew when something has changed."""

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from arview.cad.part import Part
 from arview.camera import Camera
+from arview.capture import words
 from arview.capture.advice import ComponentNeed
 from arview.capture.dome import CaptureDome, component_points
 from arview.capture.information import (
@@ -130,19 +131,15 @@ class CaptureNeeds:
     def _row(self, index: int, cell: int | None) -> ComponentNeed:
         u_mm, is_enough, can_be_seen = self._state
         photos, directions = self._counts(index, self._known.views)
-        text = ""
-        if not self._is_asked[index]:
-            text = ""
-        elif not can_be_seen[index]:
-            text = "other components hide it from every direction asked for"
-        elif not is_enough[index]:
-            lacking = self._options.coverage.photos_wanted - photos
-            text = f"{lacking} more photo{'s' * (lacking != 1)}" if lacking > 0 else "more from other sides"
-            if cell is not None and not self._dome.is_seen[cell, index]:
-                text = f"hidden from here; {text}"
+        lacking = None
+        if self._is_asked[index] and not can_be_seen[index]:
+            lacking = words.NEVER_SEEN()
+        elif self._is_asked[index] and not is_enough[index]:
+            is_hidden = cell is not None and not self._dome.is_seen[cell, index]
+            lacking = words.lacking_message(self._options.coverage.photos_wanted - photos, is_hidden)
         predicted = float(u_mm[index]) if photos >= 2 else None
         return ComponentNeed(
-            self._model.components[index].name, photos, directions, predicted, bool(is_enough[index]), text
+            self._model.components[index].name, photos, directions, predicted, bool(is_enough[index]), lacking
         )
 
     def _counts(self, index: int, views: Views) -> tuple[int, int]:
