@@ -11,6 +11,10 @@ from pathlib import Path
 
 import pytest
 
+from arview.capture import words
+from arview.core.messages import Phrase
+from arview.live.protocol import NOTICE_CODES
+from arview.live.stream.phrases import CATALOGUE
 from helpers.paths import ROOT
 
 PAGE = ROOT / "src" / "arview" / "live" / "page"
@@ -23,16 +27,16 @@ TECHNICAL = re.compile(  # names, classes, queries, and words of the server that
     r"^(?:[A-Z]\w*Error|Content-Type|Retry-After|X-Arview-Answer|Arrow\w+|Escape|Enter|Bad|GET|POST|PATCH|DELETE|"
     r"(?:[\w-]+ )+|[a-z]+: [\w-]+|\(prefers-[\w-]+: \w+\)|NOT YET CHECKED|translate\(.*)$"
 )
+PHRASES = [*CATALOGUE, *(one for one in vars(words).values() if isinstance(one, Phrase))]
 ATTRIBUTES = {"aria-label": "data-label", "alt": "data-alt", "title": "data-title", "placeholder": "data-placeholder"}
 
 
 @cache
 def catalogue(language: str) -> dict[str, str]:
-    """The texts of a language by key, those of the job included."""
+    """The texts of a language by key, those of the job and the station included."""
     sources = [(PAGE / "texts" / f"{language}.js").read_text(encoding="utf-8")]
-    job = PAGE / "job" / "texts.js"
-    if job.is_file():
-        sections = re.split(r"^const (\w\w) = \{$", job.read_text(encoding="utf-8"), flags=re.MULTILINE)
+    for more in (PAGE / "job" / "texts.js", PAGE / "texts" / "station.js"):
+        sections = re.split(r"^const (\w\w) = \{$", more.read_text(encoding="utf-8"), flags=re.MULTILINE)
         sources.append(dict(zip(sections[1::2], sections[2::2], strict=True))[language])
     entries = [(json.loads(key), json.loads(text)) for source in sources for key, text in ENTRY.findall(source)]
     texts = dict(entries)
@@ -97,7 +101,8 @@ def test_texts_that_are_asked_for_exist_and_all_are_used() -> None:
     assert asked <= set(catalogue("en")) and len(asked) > 80
     literal = set(re.findall(r'"([a-z_]+(?:\.[a-z_]+)+)"', source))
     prefixes = tuple(re.findall(r"`([a-z_.]+\.(?:no_)?)\$\{", source))
-    unused = {key for key in catalogue("en") if key not in literal and not key.startswith(prefixes)}
+    sent = {phrase.key for phrase in PHRASES}
+    unused = {key for key in catalogue("en") if key not in literal | sent and not key.startswith(prefixes)}
     assert unused <= {"noscript"}
 
 
@@ -137,3 +142,31 @@ def test_scripts_have_no_texts_of_their_own() -> None:
 def _is_internal(path: str, text: str) -> bool:
     """Errors for developers, which nobody reads on the page."""
     return text.startswith(("the model has no component ", "the snapshot is kept until ")) or path.startswith("texts/")
+
+
+def test_every_sentence_of_the_station_has_words_in_every_language() -> None:
+    assert len(PHRASES) > 100 and len({phrase.key for phrase in PHRASES}) == len(PHRASES)
+    for phrase in PHRASES:
+        assert catalogue("en")[phrase.key] == phrase.english
+        assert set(re.findall(r"\{(\w+)\}", catalogue("de")[phrase.key])) == phrase.names
+
+
+def test_every_error_of_the_station_has_words_in_every_language() -> None:
+    sources = [path.read_text(encoding="utf-8") for path in (ROOT / "src" / "arview" / "live").rglob("*.py")]
+    codes = {code for source in sources for code in re.findall(r'Refusal\(\s*\d+,\s*"(\w+)"', source)}
+    assert {"disk_full", "no_token", "other_part"} <= codes and len(codes) > 20
+    missing = {code for code in codes if f"error.{code}" not in catalogue("de")}
+    assert missing == set()
+
+
+def test_every_notice_has_words_even_where_its_text_is_unknown() -> None:
+    """Its text is a sentence of the catalogue, or there is one for its code."""
+    sources = [path.read_text(encoding="utf-8") for path in (ROOT / "src" / "arview" / "live").rglob("*.py")]
+    fixed = {
+        found[0]: found[1] for source in sources for found in re.findall(r'Notice\("(\w+)", "\w+", "([^"]+)"\)', source)
+    }
+    assert len(fixed) > 4
+    for code in NOTICE_CODES:
+        is_known = code in fixed and any(phrase.pattern.fullmatch(fixed[code]) for phrase in CATALOGUE)
+        told = {"frames_scaled": "told.scaled", "tracking_failed": "told.restarted", "stamp_unreadable": "told.damaged"}
+        assert is_known or f"code.{code}" in catalogue("de") or told.get(code) in catalogue("de"), code

@@ -42,9 +42,10 @@ class Phrase:
 
     @cached_property
     def pattern(self) -> re.Pattern[str]:
-        """What matches the sentence with any values."""
+        """What matches the sentence with any values; ``count`` is a number."""
         pieces = _PLACE.split(self.english)
-        plain = [re.escape(piece) if k % 2 == 0 else f"(?P<{piece}>.+?)" for k, piece in enumerate(pieces)]
+        values = {name: r"\d+" if name == "count" else ".+?" for name in self.names}
+        plain = [re.escape(one) if k % 2 == 0 else f"(?P<{one}>{values[one]})" for k, one in enumerate(pieces)]
         return re.compile("".join(plain), re.DOTALL)
 
 

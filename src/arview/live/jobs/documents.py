@@ -14,6 +14,7 @@ from arview.live.jobs.board import JobBoard
 from arview.live.jobs.desk import JobDesk
 from arview.live.jobs.subject import is_open
 from arview.live.stream.documents import Document
+from arview.live.stream.phrases import messages_of, texts_of
 from arview.overlay.labels import detail_text, value_text
 from arview.overlay.options import OverlayOptions
 from arview.rework import instruction_document, instructions
@@ -46,7 +47,7 @@ def job_document(job: JobFolder, desk: JobDesk) -> Document:
     board, number = desk.board, desk.part_of(job)
     inspection = board.inspection(job)
     document = {key: value for key, value in job.document.items() if key not in ("format", "version", "part")}
-    return {
+    told = {
         **document,
         "part": number,
         "state": job.state().document(),
@@ -64,6 +65,8 @@ def job_document(job: JobFolder, desk: JobDesk) -> Document:
         "rechecks": [one.id for one in job.rechecks()],
         "before_after": _before_after(job),
     }
+    messages = messages_of(texts_of({name: told[name] for name in ("state", "inspection", "rework")}))
+    return {**told, "messages": messages} if messages else told
 
 
 def rework(job: JobFolder, desk: JobDesk) -> list[Document]:

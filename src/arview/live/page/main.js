@@ -8,7 +8,7 @@ import { Devices } from "./lists/devices.js";
 import { Files } from "./lists/files.js";
 import { allNotices, blocking, retryText } from "./faults.js";
 import { askSerial } from "./serial.js";
-import { clock, t, translate } from "./texts/texts.js";
+import { clock, errorText, t, translate } from "./texts/texts.js";
 import { connectLook } from "./settings/look.js";
 import { icon } from "./icons.js";
 import { keepSnapshot } from "./lists/snapshots.js";
@@ -320,7 +320,7 @@ async function snapshot() {
     clearTimeout(styleTimer);
     await connection.ask({ hold: frame.id, style });
     const answer = await fetch(`/api/clients/${link.client}/snapshot.png?id=${frame.id}`, { cache: "no-store" });
-    if (!answer.ok) throw new Error((await answer.json()).message);
+    if (!answer.ok) throw new Error(errorText(await answer.json()));
     const moment = new Date().toISOString().slice(0, 19).replaceAll(":", "");
     const file = [titleOf(partsOf(state.part)).replaceAll(", ", "_").replaceAll(" ", "_"), moment].filter(Boolean).join("_").replace(/[^\w.-]+/g, "-");
     const blob = await answer.blob();

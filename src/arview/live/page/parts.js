@@ -105,6 +105,7 @@ class PartList {
     this.key = key;
     this.withheld = pose.withheld;
     this.completeness = pose.completeness;
+    this.completenessText = pose.completeness_text ?? pose.completeness;
     this.seen = new Map(pose.labels.map((one) => [this.names[one.index], one]));
     this.#list();
     return true;
@@ -131,7 +132,7 @@ class PartList {
 
   #list() {
     const counts = this.withheld ? [make("span", "count none", [this.withheld.title])] : tally(this.components);
-    if (this.completeness) counts.push(make("span", `count ${COMPLETENESS[this.completeness.split(":")[0]]}`, [this.completeness]));
+    if (this.completeness) counts.push(make("span", `count ${COMPLETENESS[this.completeness.split(":")[0]]}`, [this.completenessText]));
     this.tally.replaceChildren(...counts);
     this.list.replaceChildren(...this.components.map((one) => this.#row(one)));
   }

@@ -2,7 +2,7 @@
 
 import { ask, getPart } from "./transport/api.js";
 import { Message, Notices } from "./status.js";
-import { t, translate } from "./texts/texts.js";
+import { t, translate, translated } from "./texts/texts.js";
 
 const REFRESH_MS = 2000;
 const film = document.getElementById("film");
@@ -29,7 +29,7 @@ async function refresh() {
       return;
     }
     document.title = `${part.part.name} ${part.part.serial} · arview`;
-    const status = await (await ask("/api/status")).json();
+    const status = translated(await (await ask("/api/status")).json());
     notices.show(status.notices.filter((one) => one.level !== "info"));
     if (!isOn) begin();
     const { feed } = status;

@@ -17,6 +17,7 @@ from arview.live.stream.annotator import AnnotatedFrame, FrameAnnotator, Screen
 from arview.live.stream.documents import Document, pose_document
 from arview.live.stream.feed import Feed, TrackedFrame
 from arview.live.stream.newest import AsyncNewestSlot
+from arview.live.stream.phrases import with_messages
 from arview.live.stream.subject import OverlayStyle
 from arview.live.transport.webrtc import Connection
 
@@ -91,7 +92,7 @@ class Client:
 
     def document(self, tracked: TrackedFrame) -> Document:
         """*Pose* of a tracked frame for this page."""
-        document = pose_document(self.shown(tracked), time.monotonic())
+        document = with_messages(pose_document(self.shown(tracked), time.monotonic()))
         guiding = None if self.binding is None else self.binding.guiding
         if guiding is not None and (advice := guiding.document()) is not None:
             document["capture"] = advice

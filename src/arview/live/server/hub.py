@@ -32,6 +32,7 @@ from arview.live.stream.documents import (
 )
 from arview.live.stream.feed import Feed
 from arview.live.stream.notices import Notice
+from arview.live.stream.phrases import with_messages
 from arview.live.stream.recording import Recordings
 from arview.live.stream.station import StationCamera
 from arview.live.stream.subjects import Subjects
@@ -105,15 +106,15 @@ class Hub:
     async def part(self, client: str | None = None) -> Document:
         """The *Part* document, for a client that is bound to a job with the numbers of that job."""
         if self.subjects is None:
-            return self._loading
+            return with_messages(self._loading)
         bound = self.clients.get(client or "")
         if bound is not None and bound.binding is not None:
             subjects = bound.binding.view.subjects
-            return with_ages(await asyncio.to_thread(parts_document, subjects), subjects)
+            return with_messages(with_ages(await asyncio.to_thread(parts_document, subjects), subjects))
         revision = self.subjects.revision
         if self._part is None or self._part[0] != revision:
             self._part = revision, await asyncio.to_thread(parts_document, self.subjects)
-        return with_ages(self._part[1], self.subjects)
+        return with_messages(with_ages(self._part[1], self.subjects))
 
     async def glb(self, part: int) -> bytes:
         """The CAD model of a part as GLB, made once."""
@@ -296,7 +297,7 @@ class Hub:
             if self._station is not None:
                 described["state"], described["text"] = self._station.state
         recorder = self.recordings.of(feed) if self.recordings is not None and feed is not None else None
-        return {
+        document: Document = {
             "type": "status",
             "revision": subjects.revision if subjects is not None else 0,
             "mode": client.mode if client is not None else None,
@@ -312,6 +313,7 @@ class Hub:
             "clients": len(self.clients),
             "max_clients": self.options.max_clients,
         }
+        return with_messages(document)
 
     async def close(self) -> None:
         """Remove all clients, close the station camera and finish the files."""

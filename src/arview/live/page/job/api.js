@@ -1,10 +1,11 @@
 // Requests about jobs: see the HTTP API in arview/live/protocol.py.
 
+import { translated } from "../texts/texts.js";
 import { ask } from "../transport/api.js";
 
 const at = (id, path = "") => `/api/jobs/${encodeURIComponent(id)}${path}`;
-const get = async (path) => (await ask(path)).json();
-const post = async (path, json) => (await ask(path, { method: "POST", json })).json();
+const get = async (path) => translated(await (await ask(path)).json());
+const post = async (path, json) => translated(await (await ask(path, { method: "POST", json })).json());
 
 /** Addresses of a job's files, for links and pictures. */
 export const fileOf = (id, name) => at(id, `/${name.split("/").map(encodeURIComponent).join("/")}`);

@@ -2,7 +2,7 @@
 
 import { icon, make } from "../icons.js";
 import { rounded } from "../rounding.js";
-import { t } from "../texts/texts.js";
+import { language, t } from "../texts/texts.js";
 import { fileOf } from "./api.js";
 import { bySeverity, counts, verdictSign, verdictWord } from "./verdicts.js";
 
@@ -59,7 +59,7 @@ export class ResultsView {
     if (state.stage === "failed") {
       const more = make("button", "wide", [t("job.more_photos")]);
       more.addEventListener("click", () => this.events.onMore());
-      return make("div", "job-progress failed", [make("p", "", [icon("error"), state.text || t("job.failed")]), more], { role: "alert" });
+      return make("div", "job-progress failed", [make("p", "", [icon("error"), state.text || t("job.failed")]), ...original(state), more], { role: "alert" });
     }
     const total = state.total || 0, share = total ? Math.min(100, Math.round((100 * state.done) / total)) : null;
     const bar = make("progress", "", [], { max: "100", "aria-label": t("job.measuring") });
@@ -72,7 +72,7 @@ export class ResultsView {
   #banner({ state, inspection, components: checked }) {
     // A check again is about its own components only.
     const components = inspection.components.filter((one) => !checked || checked.includes(one.name));
-    const verdict = checked ? bySeverity(components)[0]?.verdict : inspection.verdict, sentence = checked ? "" : inspection.sentence;
+    const verdict = checked ? bySeverity(components)[0]?.verdict : inspection.verdict, sentence = checked ? "" : language === "en" ? inspection.sentence : t("job.sentence", { count: components.length });
     const isRough = Boolean(state.is_rough) || state.stage !== "done";
     const list = counts(components).map(([kind, count]) => make("span", `count ${kind}`, [icon(kind), `${count} ${verdictWord(kind)}`]));
     const words = [make("b", "", [isRough ? t("job.provisional") : verdictWord(verdict)])];
@@ -136,6 +136,9 @@ export class ResultsView {
     return make("details", "job-photos", [make("summary", "", [t("job.photos", { photos: job.photos.length })]), make("div", "", pictures)]);
   }
 }
+
+/** What the station says of a failure in its own language, where the page has no words for it. */
+const original = (state) => (state.original ? [make("details", "", [make("summary", "", [t("job.failed_why")]), make("p", "", [state.original], { lang: "en" })])] : []);
 
 /** A length as text; a dash where there is none. */
 const mm = (value) => make("b", "", [value === null || value === undefined ? "–" : `${value.toFixed(2)} mm`]);

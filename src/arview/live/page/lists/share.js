@@ -1,5 +1,7 @@
 // Opening, saving and sharing files: with the device's own share sheet where the browser has one, else as a download.
 
+import { errorText } from "../texts/texts.js";
+
 /** Whether this browser can share a file of this type. */
 export function canShare(type) {
   try {
@@ -41,6 +43,6 @@ export async function share(source, name) {
 
 async function fetched(address) {
   const answer = await fetch(address, { credentials: "same-origin", cache: "no-store" });
-  if (!answer.ok) throw new Error((await answer.json().catch(() => ({}))).message ?? String(answer.status));
+  if (!answer.ok) throw new Error(errorText(await answer.json().catch(() => ({}))) ?? String(answer.status));
   return answer.blob();
 }

@@ -1,5 +1,5 @@
-// The texts of the page: one catalogue for each language, with English for whatever a language lacks. Messages that the
-// server makes (reasons of the tracking, notices, errors) are English.
+// The texts of the page: one catalogue for each language, with English for whatever a language lacks. Sentences of the
+// server are English; of those that the page knows, key and values come along (`messages` in the protocol).
 
 import de from "./de.js";
 import en from "./en.js";
@@ -28,7 +28,50 @@ export function t(key, values = {}) {
     console.error(`no text for ${key}`);
     return key;
   }
-  return text.replace(/\{(\w+)\}/g, (whole, name) => (name in values ? String(values[name]) : whole));
+  return text.replace(/\{(\w+)\}/g, (whole, name) => (name in values ? inWords(values[name]) : whole));
+}
+
+/** A value of a text: another text {key, values}, a list of them, or a name or number. */
+function inWords(value) {
+  if (Array.isArray(value)) return value.map(inWords).join(", ");
+  return value?.key ? t(value.key, value.values) : String(value);
+}
+
+const SAID = new Set(["text", "reason", "remark", "title", "value", "word", "notes", "value_text", "mismatches", "lacking"]);
+const OF_PEOPLE = new Set(["decisions", "signed", "record", "messages"]); // what people wrote stays as it is
+
+/** A document of the server with its sentences in the language of the page; see `messages` in the protocol. */
+export function translated(document) {
+  if (language === "en" || document === null || typeof document !== "object") return document;
+  return inLanguage(document, document.messages ?? {});
+}
+
+function inLanguage(value, messages) {
+  if (Array.isArray(value)) return typeof value[0] === "object" ? value.map((one) => inLanguage(one, messages)) : value;
+  if (value === null || typeof value !== "object") return value;
+  const known = value.messages ? { ...messages, ...value.messages } : messages, made = {};
+  for (const [key, one] of Object.entries(value)) {
+    if (OF_PEOPLE.has(key)) made[key] = one;
+    else if (SAID.has(key)) made[key] = Array.isArray(one) ? one.map((text) => sentence(text, known)) : typeof one === "string" ? sentence(one, known) : inLanguage(one, known);
+    else made[key] = inLanguage(one, known);
+  }
+  if (typeof value.completeness === "string") made.completeness_text = sentence(value.completeness, known);
+  const isUnknown = typeof value.text === "string" && value.text !== "" && made.text === value.text;
+  // A notice has a sentence for its code; the state of a job has its stage, and its text is kept as it came.
+  if (isUnknown && typeof value.code === "string" && hasText(`code.${value.code}`)) made.text = t(`code.${value.code}`);
+  if (isUnknown && typeof value.stage === "string") Object.assign(made, { text: "", original: value.text });
+  return made;
+}
+
+/** A sentence of the server, or several that "; " divides. */
+function sentence(text, messages) {
+  if (messages[text]) return inWords(messages[text]);
+  return text.split("; ").map((one) => (messages[one] ? inWords(messages[one]) : one)).join("; ");
+}
+
+/** The message of an error {error: code, message} of the server. */
+export function errorText({ error, message }) {
+  return language !== "en" && hasText(`error.${error}`) ? t(`error.${error}`) : message;
 }
 
 /** Whether there is a text for this key. */

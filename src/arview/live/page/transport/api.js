@@ -1,6 +1,7 @@
 // Requests to the server, and its error messages.
 
-import { t } from "../texts/texts.js";
+import "../texts/station.js";
+import { errorText, t, translated } from "../texts/texts.js";
 
 /** An error response of the server, or no response at all (code "offline"). */
 export class Refusal extends Error {
@@ -36,13 +37,13 @@ export async function ask(path, { method = "GET", json, body, headers = {}, keep
     document = await answer.json();
   } catch { /* an error that arview did not send has no JSON body */ }
   throw new Refusal(
-    answer.status, document.error ?? "error", document.message ?? t("link.status", { status: answer.status }),
+    answer.status, document.error ?? "error", errorText(document) ?? t("link.status", { status: answer.status }),
     Number(answer.headers.get("Retry-After")) || 0,
   );
 }
 
 /** The parts; of a client that is in a job, with the numbers of that job. */
-export const getPart = async (client = null) => (await ask(client ? `/api/part?client=${client}` : "/api/part")).json();
+export const getPart = async (client = null) => translated(await (await ask(client ? `/api/part?client=${client}` : "/api/part")).json());
 export const getModel = async (id) => (await ask(`/api/model.glb?part=${id}`)).arrayBuffer();
 
 /** The parts of a *Part* or *Pose* document: their list, or the document itself where there is only one. */
@@ -67,6 +68,6 @@ export function leave(client) {
 
 /** Send a Control request; returns the Status of the client. */
 export const control = async (client, request) =>
-  (await ask(`/api/clients/${client}/control`, { method: "POST", json: request })).json();
+  translated(await (await ask(`/api/clients/${client}/control`, { method: "POST", json: request })).json());
 
-export const getStatus = async (client, signal) => (await ask(`/api/clients/${client}/status`, { signal })).json();
+export const getStatus = async (client, signal) => translated(await (await ask(`/api/clients/${client}/status`, { signal })).json());

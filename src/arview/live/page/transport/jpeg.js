@@ -1,5 +1,6 @@
 // Transport without WebRTC: JPEG pictures over HTTP, one at a time.
 
+import { translated } from "../texts/texts.js";
 import { ask, getStatus, join, leave } from "./api.js";
 
 const QUALITY = 0.85, STATUS_EVERY_MS = 1000, MAX_FAILURES = 3;
@@ -105,7 +106,7 @@ export class JpegLink {
 
   async #process(answer, takenMs, sentMs) {
     const header = answer.headers.get("X-Arview-Answer");
-    const pose = header ? JSON.parse(header) : await answer.json();
+    const pose = translated(header ? JSON.parse(header) : await answer.json());
     // The round trip can only be measured for a phone: a request for a station's frame waits for an unknown time.
     if (takenMs !== null) this.rttMs = Math.max(0, performance.now() - sentMs - pose.server_ms);
     if (header) {

@@ -3,7 +3,7 @@
 import { CANVAS_OPTIONS } from "../graphics.js";
 import { ask, join, leave } from "./api.js";
 import { watchFrames } from "../camera.js";
-import { t } from "../texts/texts.js";
+import { t, translated } from "../texts/texts.js";
 import { drawStrip, readStamp, stripHeight } from "./stamp.js";
 
 const GATHER_MS = 1500, CONNECT_MS = 9000, SILENT_MS = 5000, RTT_EVERY_MS = 2000;
@@ -39,7 +39,7 @@ export class WebrtcLink {
     const peer = (this.peer = new RTCPeerConnection({ iceServers: [] }));
     try {
       const channel = this.channel = peer.createDataChannel("arview", { ordered: false, maxRetransmits: 0 });
-      channel.addEventListener("message", (event) => this.#process(JSON.parse(event.data)));
+      channel.addEventListener("message", (event) => this.#process(translated(JSON.parse(event.data))));
       channel.addEventListener("close", () => this.#end(t("link.closed")));
       this.#addVideo(peer);
       await peer.setLocalDescription(await peer.createOffer());
@@ -139,7 +139,7 @@ export class WebrtcLink {
     if (performance.now() - this.#receivedMs > SILENT_MS) {
       // The server sends a message every second; try HTTP before giving up.
       try {
-        this.events.onStatus(await (await ask(`/api/clients/${this.client}/status`)).json());
+        this.events.onStatus(translated(await (await ask(`/api/clients/${this.client}/status`)).json()));
       } catch (error) {
         return this.#end(error.message);
       }
