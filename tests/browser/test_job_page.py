@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 from collections.abc import Iterator
 from typing import Any
 
 import pytest
 
+from arview.capture import CaptureAdvice, ComponentNeed, capture_document, words
 from arview.live.server import clients
 from arview.live.stream import documents
 from helpers import live_browser
@@ -20,6 +22,13 @@ from helpers.told_jobs import CELLS, ToldJobs
 WIDTH, HEIGHT, FPS = 640, 360, 5
 PHONE = {"width": 390, "height": 844}
 JOB = "job_BP-0012"
+ENGLISH = re.compile(r"\b(the|is|are|not|this|from|more|of|with|and|here|photos?)\b", re.IGNORECASE)
+VISIBLE_TEXTS = """
+[...document.querySelectorAll('body *')]
+  .filter((one) => one.checkVisibility?.({visibilityProperty: true}) && !one.closest('[lang=en]'))
+  .flatMap((one) => [...one.childNodes].filter((node) => node.nodeType === 3).map((node) => node.textContent.trim())
+    .concat([one.getAttribute('title') ?? '', one.getAttribute('aria-label') ?? '']))
+  .filter((text) => /[a-z]{2}/i.test(text))"""
 ADVICE: dict[str, Any] = {}
 """What every pose says of the capture."""
 pytestmark = pytest.mark.slow
@@ -268,3 +277,26 @@ def test_check_again_shows_before_and_after(chromium: Any, server: Running, jobs
         assert "1.36 mm" in page.inner_text("#job .before-after .was")
         page.locator("#job .primary", has_text="Result").click()
         until(page, lambda: "1.36 → 0.04 mm, PASS" in page.inner_text("#job .component[data-name=post_1]"))
+
+
+def test_a_german_page_says_in_german_what_the_station_says(chromium: Any, server: Running, jobs: ToldJobs) -> None:
+    way = words.BOTH(first=words.more_message(6, [words.LEFT] * 6), second=words.HIDDEN_ONE(name="bracket_2"))
+    advice = CaptureAdvice(
+        False, 0, way, words.CLOSER(), 0.3, False, 4, (), "far",
+        (ComponentNeed("post_1", 1, 1, None, False, words.lacking_message(3, True)),),
+    )  # fmt: skip
+    with opened(chromium, server, WATCH, PHONE, locale="de-DE") as page:
+        capture(page, jobs)
+        advise(**{**capture_document(advice, JOB), "cells": "0" * len(CELLS)})
+        until(page, "document.querySelector('#job-hud .hud-text').textContent.includes('verdeckt')")
+        assert page.text_content("#job-hud .hud-text") == "noch 6 von links; bracket_2 ist von hier verdeckt"
+        assert page.text_content("#job-hud .hud-reason") == "näher heran"
+        page.wait_for_selector(".need", state="attached")
+        assert page.get_attribute(".need", "title") == "von hier verdeckt; noch 3 Fotos"
+        found = page.evaluate(VISIBLE_TEXTS)
+        assert len(found) > 10
+        assert [text for text in found if ENGLISH.search(text)] == []
+    with opened(chromium, server, WATCH, PHONE) as page:
+        capture(page, jobs)
+        until(page, "document.querySelector('#job-hud .hud-text').textContent.includes('hidden')")
+        assert page.text_content("#job-hud .hud-text") == way.text

@@ -16,9 +16,11 @@ VIEWPORT = {"width": 680, "height": 640}
 
 
 @contextmanager
-def opened(chromium: Any, server: Running, script: str = "", viewport: dict[str, int] = VIEWPORT) -> Iterator[Any]:
-    """The open page; at the end it is checked that it raised no errors."""
-    context = chromium.new_context(viewport=viewport, accept_downloads=True)
+def opened(
+    chromium: Any, server: Running, script: str = "", viewport: dict[str, int] = VIEWPORT, **settings: Any
+) -> Iterator[Any]:
+    """The open page, with settings of the browser's context; at the end it is checked that it raised no errors."""
+    context = chromium.new_context(viewport=viewport, accept_downloads=True, **settings)
     page = context.new_page()
     troubles: list[str] = []
     page.on("pageerror", lambda error: troubles.append(f"error: {error}"))

@@ -26,6 +26,7 @@ def subject() -> Any:
     part = load_part(PART)
     inspection = load_inspection(INSPECTION, part.model)
     return SimpleNamespace(
+        pending=frozenset(),
         part=part, inspection=inspection, serial=inspection.serial, label_options=OverlayOptions()
     )  # fmt: skip
 
