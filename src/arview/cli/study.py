@@ -1,4 +1,4 @@
-"""The commands study …: accuracy of the registration, on simulated posts and on clouds."""
+"""The commands study …: what the accuracy of a measurement depends on, with simulated posts, clouds and photos."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from arview.cli.common import main, say
+from arview.cli.common import main, say, stage_bar
 from arview.errors import InputError
 
 if TYPE_CHECKING:
@@ -28,16 +28,18 @@ def study_options(command: Callable[..., None]) -> Callable[..., None]:
 
 
 @main.group(
-    short_help="Studies of the registration, on simulated posts and clouds.",
+    short_help="Studies of accuracy, with simulated posts, clouds and photos.",
     epilog="""\b
 Examples:
   arview study noise -o studies/
   arview study density --quick
   arview study registration --cloud scan.ply --part part.toml
+  arview study photos out/ --part part.toml
 
 \b
 Each command writes CSV and PNG to FOLDER and prints a summary. The posts are 16 mm across and 40 mm
-high; measured points are sampled at random from their surface. registration and bias also take a cloud.""",
+high; measured points are sampled at random from their surface. registration and bias also take a cloud,
+and photos takes the result of `arview inspect`.""",
 )
 def study() -> None:
     """Bias and spread of registrations, and what they depend on."""
@@ -247,6 +249,58 @@ def finding(part: str, runs: int | None, output: str, quick: bool, seed: int) ->
     from arview.measurement.studies import finding_study
 
     _write(lambda: finding_study(part, quick, seed, runs), output)
+
+
+@study.command(
+    "photos",
+    short_help="Number and layout of the photos against the error.",
+    epilog="""\b
+Examples:
+  arview study photos out/ --part part.toml
+  arview study photos out/ --part samples/plate/part.toml --truth samples/plate/truth.json --quick
+  arview study photos out/ --part part.toml --numbers 6,12,24 --layouts spread,random
+
+\b
+FOLDER is what `arview inspect` or `arview reconstruct` wrote. Some of its photos at a time are adjusted and
+measured without the others. Without --truth they are compared with the measurement of all photos. Layouts:
+  spread      as far apart as possible
+  random      at random
+  one side    within a sector of 110 degrees
+  one height  within a band of heights of 12 degrees
+All layouts that a number of photos allows are measured, and all photos together.""",
+)
+@click.argument("folder", metavar="FOLDER")
+@click.option("--part", required=True, metavar="PART", help="Part or CAD file.")
+@click.option("--truth", metavar="JSON", help="True positions of the components; default: the result of all photos.")
+@click.option("--photos", metavar="FOLDER", help="Folder of the photos, if they have been moved.")
+@click.option("--numbers", default="6,8,12,16,24,36,48,60", show_default=True, metavar="N,N", help="Numbers of photos.")
+@click.option("--layouts", default="spread,random,one side,one height", show_default=True, metavar="NAME,NAME",
+              help="Layouts.")  # fmt: skip
+@click.option("--runs", type=click.IntRange(min=1), metavar="N", help="Sets of each number and layout.  [default: 2]")
+@study_options
+def photos(
+    folder: str, part: str, truth: str | None, photos: str | None, numbers: str, layouts: str, runs: int | None,
+    output: str, quick: bool, seed: int,
+) -> None:  # fmt: skip
+    """Error of every component by number and layout of the photos, from 6 to as many as there are.
+
+    --quick measures one set of 8 and of 16 photos of each layout.
+    """
+    from arview.measurement.studies import photo_study
+    from arview.measurement.studies.photos import QUICK_NUMBERS, PhotoStudyOptions
+
+    try:
+        counts = tuple(int(one) for one in numbers.split(","))
+    except ValueError:
+        raise InputError(f"--numbers {numbers!r}: expected whole numbers with commas between them") from None
+    names = tuple(one.strip() for one in layouts.split(","))
+    options = PhotoStudyOptions(QUICK_NUMBERS if quick else counts, runs or (1 if quick else 2), seed, names)
+
+    def made() -> Study:
+        with stage_bar() as progress:
+            return photo_study(folder, part, truth, photos, options, progress)
+
+    _write(made, output)
 
 
 def _write(make: Callable[[], Study], output: str) -> None:

@@ -1,4 +1,4 @@
-"""Studies of the registration with simulated posts and with clouds; each writes its results as CSV and a picture."""
+"""Studies of the registration with simulated posts, clouds and photos; each writes its results as CSV and a picture."""
 
 from arview.measurement.studies.bias_map import bias_study
 from arview.measurement.studies.cloud_registration import cloud_registration_study
@@ -8,6 +8,7 @@ from arview.measurement.studies.displacement import displacement_study
 from arview.measurement.studies.finding import finding_study
 from arview.measurement.studies.minima import minima_study
 from arview.measurement.studies.noise import noise_study
+from arview.measurement.studies.photos import photo_study
 from arview.measurement.studies.registration import registration_study
 from arview.measurement.studies.rice import rice_study
 from arview.measurement.studies.sampling import sampling_study
@@ -22,6 +23,7 @@ __all__ = [
     "finding_study",
     "minima_study",
     "noise_study",
+    "photo_study",
     "registration_study",
     "rice_study",
     "sampling_study",
