@@ -57,6 +57,16 @@ def test_wrong_poses_just_before_the_loss_do_not_lead_astray() -> None:
     assert motion.leads_to(LAST + 8, moved((LAST + 8) * STEP))
 
 
+def test_a_frame_in_doubt_before_the_loss_does_not_end_the_motion() -> None:
+    motion = followed()
+    motion.add(LAST + 2, moved((LAST + 2) * STEP + [0.0, 0.0, -0.6 * DIAMETER_MM]))
+    assert motion.leads_to(LAST + 8, moved((LAST + 8) * STEP))
+    assert not motion.leads_to(LAST + 8, moved((LAST + 8) * STEP + [0.0, 0.5 * DIAMETER_MM, 0.0]))
+    # After a longer break nothing is known of the motion until two more poses show it.
+    motion.add(LAST + 9, moved((LAST + 9) * STEP))
+    assert not motion.leads_to(LAST + 12, moved((LAST + 12) * STEP))
+
+
 def test_nothing_is_said_without_a_motion() -> None:
     motion = OwnMotion(PartOutline(assembly_views(), CAMERA), OwnMotionOptions())
     assert not motion.leads_to(1, START)

@@ -357,7 +357,11 @@ class IdentityMonitor:
             return None
         if not doubt.reason and doubt.stage < 2:
             self._search_once(image, pose, doubt, finders)
-            return None
+            if doubt.stage < 2 and not doubt.is_placed and not doubt.reason:
+                # Without the background the two pictures say all that can be known: both are looked at now.
+                self._search_once(image, pose, doubt, finders)
+            if doubt.is_placed or doubt.reason:
+                return None
         if self._motion.homography is not None and time_s >= doubt.next_check_s:
             doubt.next_check_s = time_s + (o.return_every_s if doubt.reason else o.watch_every_s)
             seen = self._seen_at_old_place(image, pose, finders)
@@ -369,7 +373,7 @@ class IdentityMonitor:
         return None
 
     def _search_once(self, image: NDArray[np.uint8], pose: Array, doubt: Doubt, finders: Finders) -> None:
-        """Look for another specimen in the picture before the gap, and in a later frame in the present one."""
+        """Look for another specimen in the picture before the gap, and the next time in the present one."""
         assert self._kept is not None
         if doubt.stage == 0:
             doubt.is_placed = self._motion.homography is not None and self._motion.is_chained

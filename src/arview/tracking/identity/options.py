@@ -48,6 +48,7 @@ class OwnMotionOptions:
 
     Attributes:
         frames: frames before the gap over which the motion is taken.
+        max_break: frames from one sure pose to the next up to which the motion between them is taken.
         wrong_frames: the last of them whose poses may have been wrong.
         max_gap: frames without a sure pose up to which it is continued.
         near: shift in diameters from the expected place, across the line of sight, up to which the part is there.
@@ -57,6 +58,7 @@ class OwnMotionOptions:
     """
 
     frames: int = 7
+    max_break: int = 3
     wrong_frames: int = 2
     max_gap: int = 15
     near: float = 0.2

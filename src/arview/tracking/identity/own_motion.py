@@ -32,8 +32,8 @@ class OwnMotion:
         self._recent.clear()
 
     def add(self, frame: int, cam_from_model: Array) -> None:
-        """A pose (4,4) without doubt in a frame, by its number."""
-        if self._recent and frame - self._recent[-1][0] > 1:
+        """A pose (4,4) without doubt in a frame, by its number; the motion goes on over a short break."""
+        if self._recent and frame - self._recent[-1][0] > self._options.max_break:
             self._recent.clear()
         self._recent.append((frame, cam_from_model))
 
