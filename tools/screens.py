@@ -10,6 +10,8 @@ needs Chromium and Playwright, as the tests do.
 from __future__ import annotations
 
 import argparse
+import io
+import json
 import sys
 import tempfile
 from collections.abc import Callable
@@ -26,7 +28,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 from arview.pose import ComponentPresence, Identity, Presence, TrackingState, Visibility
 from helpers import live_browser
 from helpers.live_client import Running
+from helpers.live_sample import INSPECTION
 from helpers.page import changed, until
+from helpers.told_jobs import ToldJobs
 from helpers.told_session import TOLD
 from helpers.told_station import told_station
 
@@ -153,6 +157,57 @@ def devices() -> Act:
     return answers("/api/devices", {"devices": listed})
 
 
+def jpeg(seed: int) -> bytes:
+    """A photo of a pattern, another one for each seed."""
+    v, u = np.mgrid[0:480, 0:640]
+    picture = np.stack([(u * (1 + seed) + v) % 256, (v + 40 * seed) % 256, (u + v) % 256], axis=-1).astype(np.uint8)
+    kept = io.BytesIO()
+    Image.fromarray(picture).save(kept, "JPEG")
+    return kept.getvalue()
+
+
+def decision(**decided: Any) -> Act:
+    """A measured job with a failing component, photos and an instruction; ``decided`` was decided about it."""
+    record = json.loads(INSPECTION.read_text())["components"]
+    keys = ("name", "verdict", "distance_mm", "uncertainty_mm")
+    more = {"detail_text": "dx +1.21  dz −0.44   U 0.09"}
+    components = [
+        {**{key: one[key] for key in keys}, **more, "value_text": f"{one['distance_mm'] or 0.0:.2f} mm"}
+        for one in record
+    ]
+    found = {"verdict": "fail", "sentence": "12 components: 1 out of tolerance, 11 in tolerance", "note": ""}
+    instruction = {
+        "component": "post_1", "how": "unbolt", "text": "", "place": "", "turn": None, "remark": "", "pictures": [],
+        "moves": [{"text": "1.31 ± 0.09 mm towards hole_B"}],
+        "steps": ["Loosen the bolts of post_1 until it can be moved; leave them in.", "1.31 ± 0.09 mm towards hole_B"],
+    }  # fmt: skip
+    taken = f"decisions/{'3fa09c41' * 8}.jpg"
+    entries = [{"component": "post_1", "time": "2026-11-27T06:20:00Z", "photo": taken, **decided}] if decided else []
+
+    def act(page: Any) -> None:
+        jobs = ToldJobs()
+        photos = [f"{number:04d}.jpg" for number in range(1, 5)]
+        jobs.stored += [jpeg(number) for number in range(4)]
+        jobs.attached.append(jpeg(5))
+        job = jobs.add(
+            "job_BP-0417", serial="BP-0417", photos=photos, rework=[instruction], decisions=entries,
+            attachments=[taken], inspection={**found, "components": components, "created": "2026-11-27T06:12:00Z"},
+        )  # fmt: skip
+        job["state"] = {**job["state"], "stage": "done", "photos": 4, "cloud": "done"}
+        jobs.attach(page)
+
+    return act
+
+
+def component_of_job(*then: Act) -> Act:
+    """Open the failing component of the job, and scroll to its decision."""
+    job = ".job-list button, #job .jobs button, #job li button"
+    opened = both(click("#open-job"), lambda page: page.wait_for_selector(job), click(job))
+    row = '#job .component[data-name="post_1"]'
+    shown = "document.querySelector('#job .job-choices, #job .job-decided').scrollIntoView({ block: 'center' })"
+    return both(opened, lambda page: page.wait_for_selector(row), click(row), evaluate(shown), *then)
+
+
 def in_the_future(part: dict[str, Any]) -> None:
     made = datetime.now(UTC) + timedelta(days=2)
     part["inspection"] |= {"created": made.isoformat().replace("+00:00", "Z"), "age_s": -172_800}
@@ -188,6 +243,15 @@ def shots() -> list[Shot]:
     open_files = both(parts, click('[data-tab="files"]'))
     open_devices = both(parts, click('[data-tab="devices"]'))
     revoke = both(open_devices, lambda page: page.wait_for_timeout(500), click(".devices li:nth-child(2) button"))
+    form = component_of_job()
+    chosen_photo = component_of_job(
+        lambda page: page.select_option("#job-photo", "0002.jpg"),
+        evaluate("document.querySelector('#job .job-photo').scrollIntoView({ block: 'center' })"),
+    )
+    buttons = component_of_job(
+        evaluate("document.querySelector('#job .job-photo').scrollIntoView({ block: 'center' })")
+    )
+    said = {"is_ok": False, "reason": "Scrap", "note": "bent in transport", "by": "M. Lang"}
     to_devices = evaluate("document.querySelector('#devices').scrollIntoView()")
     return [
         Shot("loading", before=answers("/api/part", loading), ready=message),
@@ -219,6 +283,19 @@ def shots() -> list[Shot]:
         Shot("card", after=card),
         Shot("serial", after=evaluate(SERIAL)),
         Shot("job", after=click("#open-job")),
+        *(Shot(f"decision, {name}", size=shape, before=both(appearance(theme), decision()), after=form, settings=one)
+          for name, shape, theme, one in (
+              ("dark", PHONE, "dark", {}), ("light", PHONE, "light", {}), ("German", PHONE, "dark", german),
+              ("German, light", PHONE, "light", german), ("desk", DESK, "dark", {}), ("desk, light", DESK, "light", {}),
+              ("desk, German", DESK, "dark", german), ("desk, German, light", DESK, "light", german),
+          )),
+        *(Shot(f"decision, buttons, {name}", before=both(appearance(theme), decision()), after=buttons, settings=one)
+          for name, theme, one in (("dark", "dark", {}), ("German, light", "light", german))),
+        Shot("decision, photo, desk", size=DESK, before=decision(), after=chosen_photo),
+        Shot("decision, photo", before=decision(), after=chosen_photo, settings=german),
+        Shot("decision, made", before=decision(**said), after=component_of_job()),
+        Shot("decision, made, German, light", before=both(appearance("light"), decision(**said)), settings=german,
+             after=component_of_job()),
         Shot("zoomed, arrows", after=both(*[click("#zoom-in")] * 3)),
         Shot("station video", after=video),
         *(Shot(f"{theme}, {name}", before=both(appearance(theme, size), files()), after=after, size=shape)

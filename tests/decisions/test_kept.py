@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+import base64
 import csv
+import hashlib
 import io
 import json
+import re
 import sqlite3
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import sqlalchemy as sa
 from click.testing import CliRunner, Result
+from PIL import Image as PilImage
 
 from arview.cad.part import ComponentSettings, Part
 from arview.cli import ExitCode, main
-from arview.decisions import decide_component, log_of, sign_inspection, tick_step
+from arview.decisions import attach_photo, decide_component, log_of, sign_inspection, tick_step
 from arview.errors import OutputError
 from arview.history import HistoryStore
 from arview.history.tables import about, decisions
@@ -65,6 +70,30 @@ def test_the_report_shows_decisions_beside_the_measured_verdict(job: Path) -> No
     assert "released by Grace, 2" in page and "with 1 deviation accepted (block_2: agreed &lt;b&gt;)" in page
     assert '<p class="record released">' in page and 'id="decisions"' in page
     assert "Rework of block_2: step 1 done (Ada)." in page
+
+
+def test_the_report_embeds_the_photo_of_a_decision_and_names_its_hash(job: Path) -> None:
+    colors = np.zeros((300, 400, 3), dtype=np.uint8)
+    colors[:, :200], colors[:, 200:] = (220, 30, 20), (20, 40, 210)
+    kept = io.BytesIO()
+    PilImage.fromarray(colors).save(kept, "JPEG", quality=95)
+    name = attach_photo(job, kept.getvalue())
+    assert name == f"decisions/{hashlib.sha256(kept.getvalue()).hexdigest()}.jpg"
+    decide_component(job, "block_2", False, "bent", by="Ada", photo=name)
+    sign_inspection(job, "Grace", "")
+    make_report(job / "inspection.json", job / "report.html")
+    page = (job / "report.html").read_text()
+    pictures = re.findall(rf'<img src="data:image/\w+;base64,([^"]+)"[^>]* alt="{re.escape(name)}">', page)
+    assert len(pictures) == 1 and f'<span class="muted">{name}</span>' in page
+    shown = np.asarray(PilImage.open(io.BytesIO(base64.b64decode(pictures[0]))).convert("RGB")).astype(int)
+    height, width, _ = shown.shape
+    assert width > 100 and abs(width / height - 4 / 3) < 0.02
+    assert np.abs(shown[height // 2, width // 4] - (220, 30, 20)).max() < 12
+    assert np.abs(shown[height // 2, 3 * width // 4] - (20, 40, 210)).max() < 12
+    # Another picture under that name is told, and nothing is valid any longer.
+    PilImage.fromarray(colors[:, ::-1]).save(job / name, "JPEG")
+    make_report(job / "inspection.json", job / "report.html")
+    assert "the photo of the decision about block_2 (entry 1) was changed" in (job / "report.html").read_text()
 
 
 def test_a_report_without_decisions_says_nothing_of_them(job: Path) -> None:
