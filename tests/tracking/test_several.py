@@ -16,8 +16,10 @@ from arview.guideviews import GuideViewSet
 from arview.guideviews.cache import cached_guide_views
 from arview.pose import Pose, TrackingState
 from arview.tracking import TrackingSession
+from arview.tracking.search_plan import SearchPlan
+from arview.tracking.session_state import SessionState
 from arview.tracking.several.sessions import SeveralSessions
-from arview.tracking.several.specimens import hide_specimens, is_same_specimen
+from arview.tracking.several.specimens import hide_specimens, is_same_specimen, searched_picture
 from arview.video import Image
 from helpers import two_specimens
 from helpers.live_sample import PART
@@ -117,10 +119,11 @@ def test_another_part_that_is_tracked_is_hidden_from_the_first_round_of_searches
     assert sorted(side for side in found if side is not None) == [0, 1]
     assert len(second.covers) == 1 and second.others == ()
     # A part may stand on another: in the next round nothing is hidden.
-    second._state.frames_without_pose = 1
-    assert second._uncovered(image) is not image
-    second._state.frames_without_pose = 2 * second.options.search_every
-    assert second._uncovered(image) is image
+    plan = SearchPlan(others, camera, second.options)
+    assert plan.hides_parts(SessionState(frames_without_pose=1))
+    assert not plan.hides_parts(SessionState(frames_without_pose=2 * second.options.search_every))
+    assert searched_picture(image, (), second.covers, others, camera) is not image
+    assert searched_picture(image, (), (), others, camera) is image
     # Nor is a place hidden at which the other part is not sure.
     several._poses["one"] = replace(several._poses["one"], state=TrackingState.CRITICAL)
     assert several._covers("two") == ()

@@ -130,15 +130,14 @@ class BaseDetection:
         cam_from_model: Array,
         min_quality: float,
     ) -> Detection | None:
-        """The whole part elsewhere than at a pose that rests on the base alone; another thing was taken for it then.
+        """The whole part, for a pose that rests on the base alone: there, or elsewhere if another thing was taken for it.
 
-        It is asked in each frame with such a pose and mostly searches for nothing; where the part is found at the pose,
-        it is placed there.
+        It is asked in each frame with such a pose and mostly searches for nothing.
 
         Args:
             image: (H,W,3) uint8 RGB of the camera's size.
             detector: of the whole part; its searches are made one at a time.
-            components: of the part; at the pose found the picture must show more of them.
+            components: of the part; at a pose elsewhere the picture must show more of them.
             cam_from_model: (4,4) mm, the pose so far.
             min_quality: of the detection.
         """
@@ -151,10 +150,9 @@ class BaseDetection:
         found = detector.detect(image, max_results=1, searches=[searches[self._whole_searches % len(searches)]])
         if not found or found[0].quality < min_quality:
             return None
-        if self.is_same(components, found[0].cam_from_model, cam_from_model):
-            components.is_placed = True
-            return None
-        return found[0] if components.shows_more(image, found[0].cam_from_model, cam_from_model) else None
+        pose = found[0].cam_from_model
+        is_there = self.is_same(components, pose, cam_from_model)
+        return found[0] if is_there or components.shows_more(image, pose, cam_from_model) else None
 
     def is_same(self, components: AssemblyMonitor, a: Array, b: Array) -> bool:
         """Whether two poses (4,4) are the same, or would be if the base had no other components."""

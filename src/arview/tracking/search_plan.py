@@ -59,6 +59,10 @@ class SearchPlan:
             s.last_search_frame = frame
         return searches
 
+    def hides_parts(self, state: SessionState) -> bool:
+        """Whether other parts are hidden in this frame: in every second round, as the part may stand on another."""
+        return state.frames_without_pose // (2 * self._options.search_every) % 2 == 0
+
     def _next_thorough_part(self, state: SessionState, detector: Detector) -> list[int]:
         """The next part of the thorough search for a lost part; after the last one it is done for a while."""
         o, s = self._options, state

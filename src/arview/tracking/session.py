@@ -39,7 +39,7 @@ from arview.tracking.pose_recheck import LocalSearchRecheck
 from arview.tracking.search_plan import SearchPlan
 from arview.tracking.session_options import SessionOptions
 from arview.tracking.session_state import Event, SessionState
-from arview.tracking.several.specimens import CoveredPlace, hide_specimens, is_same_specimen
+from arview.tracking.several.specimens import CoveredPlace, is_same_specimen, searched_picture
 from arview.tracking.tracker import Tracker
 from arview.tracking.tracker_options import TrackerOptions
 
@@ -286,7 +286,8 @@ class TrackingSession:
             return self._align(image, self._guide)
         searches = self._search_plan.searches(image, s, self.detector)
         is_resting = searches == []
-        searched = self._uncovered(image)
+        covers = self.covers if self._search_plan.hides_parts(s) else ()
+        searched = searched_picture(image, self.others, covers, self.views, self.camera)
         detections = self._detect_remembered(searched) if is_resting else self._detect(searched, searches)
         detections = [one for one in detections if not self._is_other(one.cam_from_model)]
         reason = ""
@@ -310,14 +311,6 @@ class TrackingSession:
         if self._guide is not None and self.is_aligning:
             return self._align(image, self._guide)
         return None, s.reason
-
-    def _uncovered(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """The picture that is searched: without other specimens, and in every second round without other parts."""
-        searched = hide_specimens(image, self.others, self.views, self.camera)
-        if self._state.frames_without_pose // (2 * self.options.search_every) % 2 == 0:
-            for one in self.covers:
-                searched = hide_specimens(searched, [one.cam_from_model], one.views, self.camera)
-        return searched
 
     def _begin_detected(
         self, image: NDArray[np.uint8], found: Detection, lock_quality: float
@@ -456,8 +449,7 @@ class TrackingSession:
     def _recheck_base(self, image: NDArray[np.uint8], estimate: Estimate) -> Estimate:
         """Search again for a part of which little is seen, and go on where it is if that is elsewhere."""
         found = self._detect_base(image, [0])
-        if found is None or self._base.is_same(self.components, found.cam_from_model, estimate.cam_from_model):
-            self.components.is_placed |= found is not None
+        if found is None or self._is_placed_by(found, estimate):
             return estimate
         self._expect_base(found.cam_from_model)
         estimate = self._restart(image, found.cam_from_model)
@@ -466,12 +458,18 @@ class TrackingSession:
 
     def _recheck_whole(self, image: NDArray[np.uint8], estimate: Estimate) -> Estimate:
         """Go on where the whole part is found, if only its base was found before and that elsewhere."""
-        o, pose = self.options, estimate.cam_from_model
-        found = self._base.find_whole(image, self.detector, self.components, pose, o.lock_quality)
-        if found is None or self._is_other(found.cam_from_model):
+        pose, min_quality = estimate.cam_from_model, self.options.lock_quality
+        found = self._base.find_whole(image, self.detector, self.components, pose, min_quality)
+        if found is None or self._is_other(found.cam_from_model) or self._is_placed_by(found, estimate):
             return estimate
         self._state.hypotheses = _alternatives_of(found)
         return self._restart(image, found.cam_from_model)
+
+    def _is_placed_by(self, found: Detection, estimate: Estimate) -> bool:
+        """Whether a search found the part where it is followed, by which its pose is known to be right."""
+        is_same = self._base.is_same(self.components, found.cam_from_model, estimate.cam_from_model)
+        self.components.is_placed |= is_same
+        return is_same
 
     def _check_components(self, image: NDArray[np.uint8], estimate: Estimate, reason: str) -> str:
         """Check that the components are where the CAD has them; a part with a wrong one is never ``tracked``."""

@@ -101,3 +101,17 @@ def hide_specimens(
     spread = cv2.resize(cv2.inpaint(small, area, 3, cv2.INPAINT_TELEA), size, interpolation=cv2.INTER_LINEAR)
     share = (cv2.GaussianBlur(covered, (0, 0), options.soft_px).astype(np.float32) / 255.0)[..., None]
     return np.asarray(np.round((1.0 - share) * image + share * spread), dtype=np.uint8)
+
+
+def searched_picture(
+    image: NDArray[np.uint8],
+    others: Sequence[Array],
+    covers: Sequence[CoveredPlace],
+    views: GuideViewSet,
+    camera: Camera,
+) -> NDArray[np.uint8]:
+    """A picture without other specimens of a part, at poses (4,4), and without other parts."""
+    searched = hide_specimens(image, others, views, camera)
+    for one in covers:
+        searched = hide_specimens(searched, [one.cam_from_model], one.views, camera)
+    return searched
