@@ -130,7 +130,7 @@ class BaseDetection:
         cam_from_model: Array,
         min_quality: float,
     ) -> Detection | None:
-        """The whole part, for a pose that rests on the base alone: there, or elsewhere if another thing was taken for it.
+        """The whole part, for a pose that rests on the base alone: there, or elsewhere if that was another thing.
 
         It is asked in each frame with such a pose and mostly searches for nothing.
 
