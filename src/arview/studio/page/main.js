@@ -12,14 +12,14 @@ import { RangeTab, declare } from "./tabs/range.js";
 import { SymmetriesTab } from "./tabs/symmetries.js";
 import { TextTab } from "./tabs/text.js";
 import { TrialTab } from "./tabs/trial.js";
-import { ViewsTab, sign } from "./tabs/views.js";
+import { ICONS, ViewsTab, sign } from "./tabs/views.js";
 import { Tabs } from "./tabs.js";
 import { Tree } from "./tree.js";
 import { Dots } from "./view/dots.js";
 import { Marks } from "./view/marks.js";
 import { Shell } from "./view/shell.js";
 import { Stage } from "./view/stage.js";
-import { Views, pictureOf, wordsOfView } from "./views.js";
+import { Views, pictureOf, verdictOf, wordsOfView } from "./views.js";
 
 history.replaceState(null, "", location.pathname); // the token stays out of bookmarks and shared links
 for (const element of document.querySelectorAll("[data-icon]")) element.prepend(icon(element.dataset.icon));
@@ -185,9 +185,9 @@ function showBar() {
 function showVerdict() {
   const { views, isAssessing } = store, chip = find("verdict");
   chip.hidden = false;
-  const kind = isAssessing || !views ? "busy" : views.is_sufficient ? "pass" : "fail";
+  const { kind, words } = isAssessing || !views ? { kind: "busy" } : verdictOf(views);
   chip.className = `chip ${kind}`;
-  chip.replaceChildren(...(kind === "busy" ? ["Assessing the views …"] : [icon(kind), kind === "pass" ? "Views: sufficient" : "Views: insufficient"]));
+  chip.replaceChildren(...(kind === "busy" ? ["Assessing the views …"] : [icon(ICONS[kind]), make("span", {}, `Views: ${words}`)]));
 }
 
 async function save() {

@@ -43,6 +43,15 @@ export class Views {
   }
 }
 
+/** The verdict on the views: the kind (pass, alike, fail) that gives it colour and icon, and its words. */
+export function verdictOf({ is_sufficient: isFine, look_alikes: found }) {
+  const names = (found ?? []).filter((one) => one.is_confusable).map((one) => one.other);
+  return {
+    kind: !isFine ? "fail" : names.length ? "alike" : "pass",
+    words: [isFine ? "sufficient" : "insufficient", ...(names.length ? [`confusable with ${names.join(", ")}`] : [])].join(", "),
+  };
+}
+
 export const pictureOf = (views, index) => `/api/views/${index}.png?n=${views.key}`;
 
 /** A view in words. */

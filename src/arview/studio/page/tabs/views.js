@@ -2,7 +2,7 @@
 
 import { get } from "../api.js";
 import { icon, make, percent } from "../dom.js";
-import { pictureOf, wordsOfView } from "../views.js";
+import { pictureOf, verdictOf, wordsOfView } from "../views.js";
 
 export class ViewsTab {
   title = "Views";
@@ -29,9 +29,9 @@ export class ViewsTab {
       this.sheet.replaceChildren(); // its pictures would be those of the part before the edit
       return;
     }
-    const { is_sufficient: isFine } = views;
-    this.verdict.className = `verdict-box ${isFine ? "pass" : "fail"}`;
-    this.verdict.replaceChildren(icon(isFine ? "pass" : "fail"), make("div", {}, make("b", {}, isFine ? "sufficient" : "insufficient"), make("div", {}, reasonOf(views)),
+    const { kind, words } = verdictOf(views);
+    this.verdict.className = `verdict-box ${kind}`;
+    this.verdict.replaceChildren(icon(ICONS[kind]), make("div", {}, make("b", {}, words), make("div", {}, reasonOf(views)),
       ...(views.look_alikes ?? []).map((one) => make("p", { class: one.is_confusable ? "warning" : "" }, `${one.is_confusable ? "⚠ " : ""}${one.text}`))));
     this.advice.replaceChildren();
     this.help.hidden = Boolean(views.error);
@@ -75,6 +75,9 @@ export class ViewsTab {
     this.advice.replaceChildren(...(rows.length ? rows : [make("li", { class: "card" }, (this.store.views?.score ?? 0) >= 1 ? "Every view is distinct already: no change is needed." : "None of the changes that were tried is better. Components around the part, once they are in the CAD, would help.")]));
   }
 }
+
+/** Icons of the verdicts: the shape tells them apart where colour does not. */
+export const ICONS = { pass: "pass", alike: "warning", fail: "fail" };
 
 /** The reason without the verdict, which stands before it. */
 const reasonOf = (views) => (views.reason || "the part can be told from its surroundings").replace(/^(in)?sufficient:\s*/, "");
