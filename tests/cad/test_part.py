@@ -243,3 +243,19 @@ def test_a_selector_names_an_assembly(tmp_path):
     (tmp_path / "p.toml").write_text(text)
     roles = {s.name: s.role for s in load_part(tmp_path / "p.toml").settings}
     assert roles == {"sub_1/post": "inspect", "sub_2/post": "base", "nut": "base"}
+
+
+@pytest.mark.parametrize("name", ["a\\u0000b", "a\\u001bb", "a\\nb", "a\\u2028b"])
+def test_names_are_one_line_without_control_characters(folder: Path, name: str) -> None:
+    for key in ("name", "serial"):
+        with pytest.raises(InputError, match=rf"\[part\] {key} = .*expected text") as caught:
+            load_part(write(folder, f'{key} = "{name}"\n'))
+        assert str(caught.value).isprintable()
+
+
+def test_control_characters_in_the_names_of_a_cad_file_are_replaced(tmp_path: Path) -> None:
+    nodes: list[dict[str, object]] = [{"name": "po\u0000st\u001b", "mesh": 0}, {"name": "\u0007", "mesh": 0}]
+    path = glb_with_boxes(tmp_path / "parts.glb", nodes, [0, 1])
+    part = load_part(path)
+    assert [one.name for one in part.model.components] == ["po st", "parts"]
+    assert any("control characters in the names of 2 components" in note for note in part.notes)

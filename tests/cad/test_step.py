@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from arview.cad import load_part
 from arview.cad.formats.step import StepLimits, read_step
 from arview.cad.load import load_cad, load_model
 from arview.errors import InputError
@@ -149,3 +150,24 @@ def test_limits_of_the_reading_process(limits: StepLimits, expected: str, tmp_pa
     with pytest.raises(InputError, match=expected) as caught:
         read_step(path, 0.1, 10.0, False, limits)
     assert "\n" not in str(caught.value)
+
+
+def test_a_placeholder_of_the_writer_is_no_name(tmp_path: Path) -> None:
+    for name in ("Open CASCADE STEP translator 7.8 1", "NONE"):
+        path = StepWriter().write(tmp_path / "chip.step", StepPart(name, (20, 10, 5)))
+        assert [one.name for one in load_model(path).components] == ["chip"]
+    unnamed = StepPart("Open CASCADE STEP translator 8.0 7.1", (20, 10, 5))
+    parts = [(unnamed.name, unnamed, np.eye(4)), ("post", StepPart("post", (5, 5, 40)), np.eye(4))]
+    path = StepWriter().write(tmp_path / "a.step", StepAssembly("root", parts))
+    assert [one.name for one in load_model(path).components] == ["root", "post"]
+
+
+def test_a_tolerance_that_is_too_fine_is_named(tmp_path: Path) -> None:
+    path = StepWriter().write(tmp_path / "chip.step", StepPart("chip", (20, 10, 5)))
+    with pytest.raises(InputError, match=r"^tol_linear_mm = 1e-09 makes too many triangles; give at least 0\.0001 mm"):
+        load_model(path, tol_linear_mm=1e-9)
+    (tmp_path / "part.toml").write_text('[part]\ncad = "chip.step"\ntol_angular_deg = 1e-6\n')
+    with pytest.raises(InputError, match=r"part\.toml: \[part\] tol_angular_deg = 1e-06 makes too many"):
+        load_part(tmp_path / "part.toml")
+    with pytest.raises(InputError, match=r"could not triangulate it with tol_linear_mm = 0\.001"):
+        read_step(path, 0.001, 10.0, False, StepLimits(output_mb=0.0001))

@@ -331,7 +331,7 @@ BAD = {
         f"{chr(98 + i)}: &{chr(98 + i)} [" + ",".join([f"*{chr(97 + i)}"] * 10) + "]\n" for i in range(8)), "aliases"),
     "endless": ("a: &a [*a]\n", "aliases|not valid YAML"),
     "deep": ("[" * 20000, "nested too deeply|not valid JSON"),
-    "agisoft": ("<calibration><projection>frame</projection><w>9</w><f>5</f></calibration>", "no camera matrix"),
+    "agisoft": ("<calibration><projection>frame</projection><w>9</w><f>5</f></calibration>", "no width, height"),
     "other json": ({"a": ["b"]}, "no camera matrix.*Kalibr camchain, COLMAP"),
 }  # fmt: skip
 

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import csv
 import io
+import json
+import shutil
 from dataclasses import replace
 from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
 import pytest
+from click.testing import CliRunner
 
+from arview.cli import main
 from arview.decisions import (
     decide_component,
     decisions_csv,
@@ -303,3 +307,21 @@ def test_a_changed_check_voids_the_signature(job: Path) -> None:
     made = inspection(MODEL, (deviation("block_2", (0.05, 0.0, 0.0), CENTER["block_2"]),))
     save_inspection(made, folder / "inspection.json")
     assert not state_of_record(job).is_released
+
+
+def test_a_photo_is_checked_where_the_job_has_no_folder_of_photos(job: Path) -> None:
+    shutil.rmtree(job / "photos")
+    with pytest.raises(InputError, match=r"photo: there is no 0003\.jpg in .*photos; name a photo of the job"):
+        decide_component(job, "block_2", True, "r", by="Ada", photo="0003.jpg")
+    (job / "photos.json").write_text(json.dumps({"photos": [{"name": "0003.jpg"}]}))
+    assert decide_component(job, "block_2", True, "r", by="Ada", photo="0003.jpg").photo == "0003.jpg"
+    with pytest.raises(InputError, match=r"there is no 0004\.jpg"):
+        decide_component(job, "block_2", True, "r", by="Ada", photo="0004.jpg")
+
+
+def test_ok_and_not_ok_exclude_each_other(job: Path) -> None:
+    both = CliRunner().invoke(main, ["decide", str(job), "block_2", "--ok", "--not-ok", "--reason", "r", "--by", "Ada"])
+    assert both.exit_code == 64 and "give either --ok or --not-ok, not both" in both.stderr
+    assert not log_of(job).content().entries
+    one = CliRunner().invoke(main, ["decide", str(job), "block_2", "--not-ok", "--reason", "r", "--by", "Ada"])
+    assert one.exit_code == 0 and [entry.is_ok for entry in log_of(job).content().entries] == [False]

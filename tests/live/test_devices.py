@@ -166,6 +166,12 @@ def test_a_revoked_device_is_out_at_once(server: Running, tmp_path: Path, monkey
     assert listed.exit_code == 0 and listed.output.startswith("Device 2  paired 20")
     assert CliRunner().invoke(main, ["live", "--revoke", "Device 2"]).exit_code == 0
     wait(lambda: boss.json("GET", "/api/status")[0] == 403 and not server.hub.clients, 20)
+    for name in ("Phone A", "Phone B"):
+        Devices(tmp_path / "devices.json").pair(name)
+    both = CliRunner().invoke(main, ["live", "--devices", "--revoke", "Device"])
+    assert both.exit_code == 0 and "Device is no longer paired" in both.stderr
+    assert both.stdout.startswith("Device 2  paired 20") and len(both.stdout.splitlines()) == 1
+    assert CliRunner().invoke(main, ["live", "--revoke", "Device 2"]).exit_code == 0
     missing = CliRunner().invoke(main, ["live", "--revoke", "Device 2"])
     assert missing.exit_code == 64 and "paired are: none" in missing.stderr
     assert json.loads((tmp_path / "devices.json").read_text())["devices"] == []

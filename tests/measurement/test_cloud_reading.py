@@ -160,6 +160,10 @@ def test_the_unit_is_found_by_size() -> None:
     cube = np.random.default_rng(0).uniform(0.0, 100.0, (5000, 3))
     for unit, factor in (("mm", 1.0), ("m", 1000.0), ("inch", 25.4)):
         assert possible_units(raw_of(cube / factor), 180.0, "a.ply") == [unit]
+    for unit, factor in (("cm", 10.0), ("ft", 304.8), ("um", 1e-3)):  # tried before a usual unit that is possible
+        assert possible_units(raw_of(cube / factor), 180.0, "a.ply")[0] == unit
+    assert possible_units(raw_of(2.0 * cube / 25.4), 180.0, "a.ply") == ["inch", "cm"]
+    assert set(possible_units(raw_of(4.0 * cube / 25.4), 180.0, "a.ply")) == {"inch", "cm", "mm"}
     # A fragment of a quarter in mm, or a part on a table in inch: the place decides.
     assert possible_units(raw_of(0.25 * cube), 180.0, "a.ply") == ["mm", "inch"]
     with pytest.raises(InputError, match=r"a\.ply: is 1\.\d+e\+04 units across, the CAD 180 mm: neither in mm, m nor"):
@@ -178,8 +182,10 @@ def test_units_are_said_and_may_be_given(tmp_path: Path) -> None:
     assert by_size.scale.warnings == ("the cloud is in m (by its size beside the CAD's)",)
     (tmp_path / "b.csv").write_text("x (m),y (m),z (m)\n" + rows_of(cube / 1000.0, ","))
     assert read_cloud(tmp_path / "b.csv", nominal()).scale.warnings == ("the cloud is in m (declared by the file)",)
-    given = read_cloud(tmp_path / "b.csv", nominal(), "cm")
+    given = read_cloud(tmp_path / "b.csv", None, "cm")
     assert given.cloud is not None and given.cloud.points == pytest.approx(cube / 100.0, abs=1e-3)
+    with pytest.raises(InputError, match=r"b\.csv: in cm it is .* mm across, .*: --cloud-unit m fits"):
+        read_cloud(tmp_path / "b.csv", nominal(), "cm")
 
 
 def test_large_clouds_are_averaged_without_bias() -> None:

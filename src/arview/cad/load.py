@@ -29,6 +29,8 @@ MIN_SIZE_MM, MAX_SIZE_MM = 1.0, 100_000.0
 """Range of the diameter of a part, for files whose unit may be wrong."""
 MIN_GIVEN_MM, MAX_GIVEN_MM = 0.1, 1_000_000.0
 """Range of the diameter of a part whose unit was given by the user."""
+MIN_TOL_LINEAR_MM, MIN_TOL_ANGULAR_DEG = 1e-4, 0.1
+"""Finest tolerances of the triangles of a STEP file."""
 MAX_COORDINATE = 1e15
 """Coordinates beyond it are no geometry, and their squares overflow."""
 MAX_FLAT_SHARE = 0.02
@@ -82,9 +84,9 @@ def load_cad(
         degenerate and double triangles removed, closed surfaces wound outwards. Colours are sRGB.
 
     Raises:
-        InputError: missing, empty, broken, truncated or unsupported file; NaN vertices; no triangles; more
-            than 5 million; no unit known; a size below 1 mm or above 100 m with no ``unit`` given, below 0.1 mm
-            or above 1 km with one.
+        InputError: missing, empty, broken, truncated or unsupported file; a tolerance that is not positive or too
+            fine; NaN vertices; no triangles; more than 5 million; no unit known; a size below 1 mm or above 100 m
+            with no ``unit`` given, below 0.1 mm or above 1 km with one.
         MissingDependencyError: STEP without cascadio.
     """
     path = Path(path)
@@ -97,10 +99,7 @@ def load_cad(
         raise InputError(f"{path}: CAD of type {suffix or '(none)'!s} is not read; give one of {' '.join(SUFFIXES)}")
     if unit is not None and unit not in UNIT_MM:
         raise InputError(f"unit {unit!r} is not known; give one of {', '.join(UNIT_MM)}")
-    if not (tol_linear_mm > 0 and tol_angular_deg > 0):
-        raise InputError(
-            f"tolerances must be positive: tol_linear_mm={tol_linear_mm} tol_angular_deg={tol_angular_deg}"
-        )
+    check_step_tolerances(tol_linear_mm, tol_angular_deg)
     try:
         if path.stat().st_size == 0:
             raise InputError(f"{path}: the file is empty (0 bytes)")
@@ -142,6 +141,18 @@ def load_cad(
     model = make_model(path.stem, tuple(components))
     _check_size(model, path, unit is not None)
     return LoadedCad(model, factor_mm, tuple(raw.notes + notes), raw.up, tuple(paths))
+
+
+def check_step_tolerances(tol_linear_mm: float, tol_angular_deg: float) -> None:
+    """Raise InputError for tolerances of triangles that are not positive, or that no computer could keep."""
+    for name, value, low, unit in (
+        ("tol_linear_mm", tol_linear_mm, MIN_TOL_LINEAR_MM, "mm"),
+        ("tol_angular_deg", tol_angular_deg, MIN_TOL_ANGULAR_DEG, "deg"),
+    ):
+        if not value > 0:
+            raise InputError(f"{name} = {value:g}: tolerances must be positive")
+        if not low <= value:
+            raise InputError(f"{name} = {value:g} makes too many triangles; give at least {low:g} {unit}")
 
 
 def _read(path: Path, suffix: str, tol_linear_mm: float, tol_angular_deg: float, is_overridden: bool) -> RawModel:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from arview.cad.formats.raw import UNIT_MM
-from arview.cad.load import SUFFIXES, LoadedCad, load_cad
+from arview.cad.load import SUFFIXES, LoadedCad, check_step_tolerances, load_cad
 from arview.cad.model import Model, make_model
 from arview.cad.part import (
     DOF_NAMES,
@@ -207,13 +207,17 @@ def _read_part(root: TomlTable, path: Path, unit: str | None, load: Callable[...
     root.finish()
     head = root.table("part", required=True)
     default_name = path.resolve().parent.name if path.stem == "part" else path.stem
-    name = head.text("name", default_name)
+    name = head.line("name", default_name)
     cad_path = path.parent / head.text("cad")
     own_unit = head.choice("unit", tuple(UNIT_MM), None)
     own_up = head.choice("up", UP_AXES, None)
     tol_linear_mm = head.positive("tol_linear_mm", 0.1)
     tol_angular_deg = head.positive("tol_angular_deg", 10.0)
-    serial = head.text("serial", "") or None
+    try:
+        check_step_tolerances(cast(float, tol_linear_mm), cast(float, tol_angular_deg))
+    except InputError as error:
+        raise InputError(f"{path}: [part] {error}") from error
+    serial = head.line("serial", "") or None
     serial_pattern = _read_pattern(head)
     head.finish()
     if not cad_path.is_file():

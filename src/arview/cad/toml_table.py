@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import re
+import unicodedata
 from pathlib import Path
 from typing import Any
 
@@ -72,7 +73,16 @@ class TomlTable:
         value = self.take(key)
         if not isinstance(value, str):
             self.fail(key, value, "text in quotes")
+        if any(unicodedata.category(letter) == "Cc" and letter not in "\n\t" for letter in value):
+            self.fail(key, value, "text without control characters")
         return str(value)
+
+    def line(self, key: str, default: str) -> str:
+        """A string of one line, such as a name that is drawn and printed."""
+        value = self.text(key, default)
+        if any(unicodedata.category(letter) in ("Cc", "Zl", "Zp") for letter in value):
+            self.fail(key, value, "text of one line")
+        return value
 
     def texts(self, key: str, default: tuple[str, ...] = ()) -> tuple[str, ...]:
         """A list of strings that are not empty; the default when the key is absent."""

@@ -36,8 +36,8 @@ from arview.camera.tree import numbers_of
 from arview.errors import InputError
 
 FORMATS = (
-    "arview or BOP JSON, OpenCV YAML/XML/JSON, ROS camera_info, Kalibr camchain, COLMAP cameras.txt or .bin, RealSense "
-    "JSON or nerfstudio transforms.json"
+    "arview or BOP JSON, OpenCV YAML/XML/JSON, ROS camera_info, Kalibr camchain, COLMAP cameras.txt or .bin, Metashape "
+    "XML, RealSense JSON or nerfstudio transforms.json"
 )
 _STEREO = re.compile(r"(M|K|cameraMatrix|camera_matrix|D|distCoeffs|dist_coeffs)_?([12])")
 _ORB_SLAM = re.compile(r"(Camera\d*)\.(\w+)")

@@ -2,8 +2,8 @@
 
 The format is recognised by the content of the file, not by its name: arview's JSON, BOP ``camera.json`` and
 ``scene_camera.json``, OpenCV FileStorage (YAML, XML, JSON), ROS ``camera_info``, Kalibr camchain, COLMAP
-``cameras.txt`` and ``cameras.bin``, RealSense intrinsics as JSON, nerfstudio ``transforms.json``. Of several cameras
-in a file that differ, one is asked for as ``FILE:NAME``.
+``cameras.txt`` and ``cameras.bin``, Metashape's cameras or calibration as XML, RealSense intrinsics as JSON,
+nerfstudio ``transforms.json``. Of several cameras in a file that differ, one is asked for as ``FILE:NAME``.
 ``fov:DEG``, ``exif``, ``profile`` and ``profile:NAME`` name cameras without a file.
 """
 
@@ -22,6 +22,7 @@ from arview.camera.colmap_text import colmap_text_of_binary, entries_from_colmap
 from arview.camera.entry import CameraEntry
 from arview.camera.exif import HEIF_SUFFIXES, PHOTO_SUFFIXES, focal_length_px, read_exif
 from arview.camera.formats import FORMATS, entries_from_trees
+from arview.camera.metashape import entries_from_metashape, is_metashape
 from arview.camera.model import Camera
 from arview.camera.profiles import find_profile
 from arview.camera.tree import MAX_BYTES, parse_trees
@@ -237,6 +238,8 @@ def _read_entries(path: Path, name: str) -> list[CameraEntry]:
     try:
         if is_colmap(stripped):
             entries = entries_from_colmap(stripped, name)
+        elif is_metashape(stripped):
+            entries = entries_from_metashape(stripped, name)
         else:
             entries = entries_from_trees(parse_trees(stripped), name)
         return [entry.as_recorded() for entry in entries]

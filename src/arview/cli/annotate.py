@@ -157,12 +157,13 @@ that holds another serial number withholds the labels. See serial_pattern in the
 
 \b
 CAMERA is a file (arview or BOP JSON, OpenCV YAML/XML/JSON, ROS camera_info, Kalibr camchain, COLMAP cameras.txt,
-RealSense JSON, nerfstudio transforms.json; FILE:NAME for one of several cameras in it, like rig.yaml:cam0), fov:DEG
-(field of view along the longer side), exif, or profile:NAME (stored by `arview calibrate --profile`;
-profile alone takes the one that matches what the source says of its camera). Without it the focal length is
-guessed, and estimated from the frames in which the part is tracked: of a film in a first pass, of a camera or
-stream while it runs. --save-profile NAME keeps the estimate for --camera profile:NAME. Views from far away,
-or always from the same side, do not tell the focal length; then the guess is kept.
+Metashape XML, RealSense JSON, nerfstudio transforms.json; FILE:NAME for one of several cameras in it, like
+rig.yaml:cam0), fov:DEG (field of view along the longer side), exif, or profile:NAME (stored by
+`arview calibrate --profile`; profile alone takes the one that matches what the source says of its camera).
+Without it the focal length is guessed, and estimated from the frames in which the part is tracked: of a film in
+a first pass, of a camera or stream while it runs. --save-profile NAME keeps the estimate for --camera
+profile:NAME. Views from far away, or always from the same side, do not tell the focal length; then the guess is
+kept.
 
 \b
 Several at once. --part may be given again, and --instances N tracks N specimens of each part. Each has its

@@ -54,10 +54,21 @@ def _parse_size(ctx: click.Context, parameter: click.Parameter, value: str) -> t
     return int(width), int(height)
 
 
-def _list_devices(ctx: click.Context, parameter: click.Parameter, value: bool) -> None:
-    """Print the paired devices and exit."""
-    if not value or ctx.resilient_parsing:
+def _keep_device_option(ctx: click.Context, parameter: click.Parameter, value: bool | tuple[str, ...]) -> None:
+    """Keep the value of --devices or --revoke; with the second of them, forget and list as asked, and exit."""
+    if ctx.resilient_parsing:
         return
+    asked = ctx.meta.setdefault("arview.devices", {})
+    asked[parameter.name] = value
+    if len(asked) == 2 and any(asked.values()):
+        _revoke_devices(asked["revoke"])
+        if asked["devices"]:
+            _list_devices()
+        ctx.exit(0)
+
+
+def _list_devices() -> None:
+    """Print the paired devices."""
     from arview.live.security.devices import devices_path, read_devices
 
     devices = read_devices(devices_path())
@@ -66,21 +77,18 @@ def _list_devices(ctx: click.Context, parameter: click.Parameter, value: bool) -
         click.echo(f"{one.name:{width}}  paired {one.created:%Y-%m-%d}  last used {one.last_used:%Y-%m-%d %H:%M} UTC")
     if not devices:
         say("no device is paired")
-    ctx.exit(0)
 
 
-def _revoke_device(ctx: click.Context, parameter: click.Parameter, value: str | None) -> None:
-    """Forget a paired device and exit."""
-    if value is None or ctx.resilient_parsing:
-        return
+def _revoke_devices(names: tuple[str, ...]) -> None:
+    """Forget paired devices. Raises InputError for a name that none has."""
     from arview.live.security.devices import Devices, devices_path
 
     devices = Devices(devices_path())
-    if not devices.revoke(value):
-        names = ", ".join(one.name for one in devices.listed()) or "none"
-        raise InputError(f"--revoke {value}: there is no device of that name; paired are: {names}")
-    say(f"{value} is no longer paired")
-    ctx.exit(0)
+    for name in dict.fromkeys(names):
+        if not devices.revoke(name):
+            known = ", ".join(one.name for one in devices.listed()) or "none"
+            raise InputError(f"--revoke {name}: there is no device of that name; paired are: {known}")
+        say(f"{name} is no longer paired")
 
 
 @main.command(
@@ -100,7 +108,7 @@ Point a phone in the same network at the printed code. The first time, the phone
 the station, because browsers give the camera to secure pages only; the second address that is printed
 explains how. Nothing is installed on the phone and nothing leaves the local network. The link holds a
 token that is new in each run: whoever opens it during the run is paired, and stays so in later runs.
---devices lists the paired devices, --revoke NAME forgets one.
+--devices lists the paired devices, --revoke NAME forgets one; with both, what is left is listed.
 
 \b
 SOURCE phone: every phone sends its own camera and has its own tracker. A camera number, an RTSP or HTTP
@@ -109,7 +117,7 @@ browser of this machine only, without certificates, for trying things out.
 
 \b
 CAMERA is a file (arview or BOP JSON, OpenCV YAML/XML/JSON, ROS camera_info, Kalibr camchain, COLMAP cameras.txt,
-RealSense JSON, nerfstudio transforms.json; FILE:NAME for one of several cameras in it) or fov:DEG. It
+Metashape XML, RealSense JSON, nerfstudio transforms.json; FILE:NAME for one of several cameras in it) or fov:DEG. It
 is scaled to the frames if their aspect ratio is the same. Without it a common phone is assumed, and the
 page says so, until the focal length has been estimated from views of the part from near and from several
 sides. --save-profile NAME keeps the estimate at the end, for --camera profile:NAME.
@@ -173,10 +181,11 @@ seconds.""",
 @click.option("--jobs", "jobs", metavar="FOLDER", type=click.Path(file_okay=False),
               default="arview_jobs", show_default=True,
               help="Folder of the inspections that pages start; it is made with the first one.")  # fmt: skip
-@click.option("--devices", is_flag=True, is_eager=True, expose_value=False, callback=_list_devices,
+@click.option("--devices", is_flag=True, is_eager=True, expose_value=False, callback=_keep_device_option,
               help="List the paired phones and screens, and exit.")  # fmt: skip
-@click.option("--revoke", metavar="NAME", is_eager=True, expose_value=False, callback=_revoke_device,
-              help="Forget a paired device, of a running station too, and exit.")  # fmt: skip
+@click.option("--revoke", metavar="NAME", multiple=True, is_eager=True, expose_value=False,
+              callback=_keep_device_option,
+              help="Forget a paired device, of a running station too, and exit; may be given again.")  # fmt: skip
 @click.option("--size", callback=_parse_size, default="1280x720", show_default=True, metavar="WxH",
               help="Size of the phone's pictures in landscape.")  # fmt: skip
 @click.option("--fps", type=float, default=30.0, show_default=True, help="Frame rate of the phone's pictures.")

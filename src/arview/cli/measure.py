@@ -143,8 +143,13 @@ def measure(
         reconstruction = read_cloud(cloud_path or "", part.model, cloud_unit, rescale)
     else:
         reconstruction = read_folder(folder, photos, "cloud" in methods)
-    with stage_bar() as progress:
-        inspection = run.measure(reconstruction, part, options, progress=progress)
+    try:
+        with stage_bar() as progress:
+            inspection = run.measure(reconstruction, part, options, progress=progress)
+    except InputError as error:
+        if cloud_path is None or not str(error).startswith("cloud: "):
+            raise
+        raise InputError(f"{cloud_path}: {str(error).removeprefix('cloud: ')}") from error
     save_inspection(inspection, target)
     _print(inspection, target)
     click.get_current_context().exit(exit_code_of(overall_verdict(inspection).value))

@@ -157,19 +157,22 @@ brought up to date.""",
 )
 @click.argument("job", metavar="JOB")
 @click.argument("component", metavar="COMPONENT")
-@click.option("--ok/--not-ok", "is_ok", default=None, help="Take the component as it is, or not.")
+@click.option("--ok", is_flag=True, help="Take the component as it is.")
+@click.option("--not-ok", is_flag=True, help="Do not take the component as it is.")
 @click.option("--reason", default="", metavar="TEXT", help="Why; needed unless a component in tolerance is OK.")
 @click.option("--photo", metavar="NAME", help="A photo of the job that shows it.")
 @NOTE
 @BY
-def decide(job: str, component: str, is_ok: bool | None, reason: str, photo: str | None, note: str, by: str) -> None:
+def decide(
+    job: str, component: str, ok: bool, not_ok: bool, reason: str, photo: str | None, note: str, by: str
+) -> None:
     """Decide about COMPONENT of JOB."""
     from arview.decisions import decide_component
 
-    if is_ok is None:
-        raise click.UsageError("give --ok or --not-ok")
-    made = decide_component(job, component, is_ok, reason, note, by, photo)
-    click.echo(f"entry {made.number}: {component} {'OK' if is_ok else 'not OK'}, {made.by}")
+    if ok == not_ok:
+        raise click.UsageError("give either --ok or --not-ok, not both" if ok else "give --ok or --not-ok")
+    made = decide_component(job, component, ok, reason, note, by, photo)
+    click.echo(f"entry {made.number}: {component} {'OK' if ok else 'not OK'}, {made.by}")
     _told_state(job)
 
 

@@ -197,6 +197,14 @@ def _read(target: str | Path) -> tuple[Path, Inspection]:
     return first, load_inspection(first)
 
 
+def _reconstructed_photos(folder: Path) -> set[str]:
+    """Names of the photos of a reconstruction whose photos are kept elsewhere."""
+    try:
+        return {str(one["name"]) for one in json.loads((folder / "photos.json").read_bytes())["photos"]}
+    except (OSError, ValueError, TypeError, KeyError):
+        return set()
+
+
 def _kept_photo(path: Path, first: Path, photo: object) -> str:
     """The name under which a photo of a folder is kept in the log of the first measurement, checked."""
     name = checked_name(photo, "photo")
@@ -207,6 +215,6 @@ def _kept_photo(path: Path, first: Path, photo: object) -> str:
     if "/" in name or "\\" in name or name.startswith("."):
         raise InputError(f"photo: {name!r} is not the name of a photo")
     photos = path.parent / "photos"
-    if photos.is_dir() and not (photos / name).is_file():
-        raise InputError(f"photo: there is no {name} in {photos}")
+    if not (photos / name).is_file() and (photos.is_dir() or name not in _reconstructed_photos(path.parent)):
+        raise InputError(f"photo: there is no {name} in {photos}; name a photo of the job, or put it there")
     return name if path.resolve() == first.resolve() else f"{_RECHECK}/{path.resolve().parent.name}/{name}"

@@ -15,7 +15,14 @@ from arview.camera import Camera
 from arview.errors import InputError
 from arview.measurement.cloud.global_registration import find_model_in_cloud
 from arview.measurement.cloud.placing import cloud_in_mm, moved_to_model, orient_normals, place_cloud, scaled
-from arview.measurement.cloud.reading import UNITS_MM, possible_units, read_points, unit_of_option
+from arview.measurement.cloud.reading import (
+    UNITS_MM,
+    USUAL_UNITS,
+    check_given_unit,
+    possible_units,
+    read_points,
+    unit_of_option,
+)
 from arview.measurement.cloud.scale_check import cloud_scale
 from arview.reconstruction.colmap import read_reconstruction, sparse_model_of
 from arview.reconstruction.scale.cad import base_names
@@ -37,7 +44,8 @@ class MetricReconstruction:
         scale: the scale and what it comes from.
         cloud: the dense cloud, or None.
         rescales: a cloud alone is divided by the factor by which it is larger than the CAD's base.
-        cloud_factors: of a cloud whose unit its size leaves open, factors that are to be tried.
+        cloud_factors, cloud_units: of a cloud whose unit its size leaves open, factors that are to be tried, and the
+            units that they mean.
     """
 
     sparse: SparseModel
@@ -45,6 +53,7 @@ class MetricReconstruction:
     cloud: DenseCloud | None
     cloud_factors: tuple[float, ...] = ()
     rescales: bool = False
+    cloud_units: tuple[str, ...] = ()
 
 
 def read_folder(folder: str | Path, photos: str | Path | None = None, with_cloud: bool = True) -> MetricReconstruction:
@@ -113,8 +122,10 @@ def read_cloud(
     units = [known or "mm"]
     if known is None and model is not None:
         units = possible_units(raw, model.diameter_mm, str(path))
+    elif known is not None and model is not None:
+        check_given_unit(raw, known, model.diameter_mm, str(path))
     warnings = [f"cloud: {note}" for note in raw.notes]
-    if given is None and units[0] != "mm":
+    if given is None and units[0] != "mm" and len(units) == 1:
         how = "declared by the file" if raw.unit else "by its size beside the CAD's"
         warnings.append(f"the cloud is in {units[0]} ({how})")
     cloud = cloud_in_mm(raw, units[0])
@@ -122,7 +133,7 @@ def read_cloud(
         warnings.append(f"the {len(raw)} points of the cloud were averaged to {len(cloud.points)}")
     factors = tuple(UNITS_MM[one] / UNITS_MM[units[0]] for one in units)
     alone = _cloud_alone(cloud, tuple(warnings), factors if len(factors) > 1 else ())
-    return replace(alone, rescales=rescales)
+    return replace(alone, rescales=rescales, cloud_units=tuple(units) if len(units) > 1 else ())
 
 
 def _own_ply(path: Path) -> DenseCloud | None:
@@ -166,10 +177,13 @@ def in_model_frame(reconstruction: MetricReconstruction, part: Part) -> MetricRe
     if scale.scale is None:
         found = find_model_in_cloud(cloud, part.model, None)
     else:
-        found, factor = place_cloud(cloud, part.model, reconstruction.cloud_factors or (1.0,))
+        units = reconstruction.cloud_units
+        takes_first = bool(units) and units[0] not in USUAL_UNITS  # its size is clear, and another's is not
+        found, factor = place_cloud(cloud, part.model, reconstruction.cloud_factors or (1.0,), takes_first)
         cloud = scaled(cloud, factor)
-        if factor != 1.0:
-            warnings.append(f"the part was found in the cloud times {factor:g} only: this is its unit")
+        if units:
+            unit = units[reconstruction.cloud_factors.index(factor)]
+            warnings.append(f"the cloud is in {unit}: in this unit the part was found in it")
     moved, turned = orient_normals(moved_to_model(cloud, found), part.model, _NORMALS_WITHIN_MM)
     if turned:
         warnings.append(turned)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from unicodedata import category
 
 import numpy as np
 from numpy.typing import NDArray
@@ -111,15 +112,25 @@ def place(parent_from_mesh: Array, vertices: Array, faces: NDArray[np.int64]) ->
     return placed, faces
 
 
+def _printable(name: str) -> str:
+    """A name without control characters and line breaks, which neither labels nor tables can show."""
+    if name.isprintable():
+        return name
+    return "".join(" " if category(letter) in ("Cc", "Zl", "Zp") else letter for letter in name).strip()
+
+
 def unique_names(paths: list[tuple[str, ...]], fallback: str) -> tuple[list[str], list[str]]:
     """A unique name for every name path, and a note for each name that had to be changed.
 
     The last name of a path is used when no other component has it. Otherwise as many parents are prepended
     (``sub_1/post``) as distinguish all components of that name, or they are numbered in the order of the file.
     """
-    paths = [path or (fallback,) for path in paths]
-    names = [path[-1] for path in paths]
+    printable = [tuple(_printable(name) for name in path) for path in paths]
     notes: list[str] = []
+    if changed := sum(path != shown for path, shown in zip(paths, printable, strict=True)):
+        notes.append(f"control characters in the names of {changed} components were replaced by spaces")
+    paths = [tuple(name for name in path if name) or (fallback,) for path in printable]
+    names = [path[-1] for path in paths]
     indices: dict[str, list[int]] = {}
     for i, name in enumerate(names):
         indices.setdefault(name, []).append(i)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,10 @@ from arview.errors import InputError, MissingDependencyError
 
 StepLimits = ProcessLimits
 DEFAULT = StepLimits()
+_PLACEHOLDER_NAME = re.compile(r"Open ?CASCADE STEP translator [\d. ]+|NONE|=>\[[\d:]+\]", re.IGNORECASE)
+"""Names that writers give to products that have none."""
+_USUAL_TOL_MM, _USUAL_TOL_DEG = 0.01, 1.0
+"""Tolerances below these are named in a message when the triangulation fails."""
 _OUT_OF_MEMORY = ("bad_alloc", "MemoryError", "failed to map", "Cannot allocate memory")
 
 # trimesh, for which cascadio only registers a glTF extension, is left out, so that the process starts faster.
@@ -53,6 +58,10 @@ def read_step(
     prepared = prepare_step(data, path)
     raw = parse_gltf(_triangulated(prepared, path, tol_linear_mm, tol_angular_deg, limits), path)
     raw.up = "z"
+    for index, one in enumerate(raw.components):
+        named = tuple(name for name in one.path if not _PLACEHOLDER_NAME.fullmatch(name.strip()))
+        if named != one.path:
+            raw.components[index] = replace(one, path=named)
     missing = products_without_shape(prepared)
     if missing:
         raw.notes.append(
@@ -76,8 +85,14 @@ def _triangulated(data: bytes, path: Path, tol_linear_mm: float, tol_angular_deg
         source, target = folder / "source.step", folder / "tessellated.glb"
         source.write_bytes(data)
         numbers = [repr(float(tol_linear_mm)), repr(float(np.deg2rad(tol_angular_deg)))]
+        is_fine = tol_linear_mm < _USUAL_TOL_MM or tol_angular_deg < _USUAL_TOL_DEG
         code, printed = run_limited(_STEP_TO_GLB, [str(source), str(target), *numbers], folder, size_mb, limits)
         glb = target.read_bytes() if target.is_file() and code == 0 else b""
+    if is_fine and (code or not glb):
+        raise InputError(
+            f"{path}: OpenCASCADE could not triangulate it with tol_linear_mm = {tol_linear_mm:g}, tol_angular_deg = "
+            f"{tol_angular_deg:g}; raise them (0.1 and 10 are usual)"
+        )
     if code in (TIMED_OUT, -9):
         raise InputError(
             f"{path}: OpenCASCADE did not read it in {limits.cpu_of(size_mb):.0f} s of computing; is it broken? "

@@ -53,13 +53,16 @@ def cloud_in_mm(raw: RawPoints, unit: str, options: ThinningOptions | None = Non
     return dense_cloud(together.points + raw.origin * factor, None if raw.normals is None else together.normals)
 
 
-def place_cloud(cloud: DenseCloud, model: Model, factors: Sequence[float] = (1.0,)) -> tuple[Similarity, float]:
+def place_cloud(
+    cloud: DenseCloud, model: Model, factors: Sequence[float] = (1.0,), takes_first: bool = False
+) -> tuple[Similarity, float]:
     """Find the CAD in a cloud whose unit may be one of several.
 
     Args:
         cloud: in mm, if the first factor is right.
         model: the nominal CAD.
         factors: mm per unit of the cloud that are to be tried, the most likely first.
+        takes_first: do not try the others once the part is found.
 
     Returns:
         the place, with scale 1, and the factor by which the cloud must be multiplied before.
@@ -74,6 +77,8 @@ def place_cloud(cloud: DenseCloud, model: Model, factors: Sequence[float] = (1.0
             found.append((find_model_in_cloud(scaled(cloud, factor), model), factor))
         except InputError as error:
             failure = failure or error
+        if found and takes_first:
+            break
     if not found:
         raise failure or InputError("cloud: no unit was given")
     if len(found) > 1:

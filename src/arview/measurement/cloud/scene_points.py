@@ -30,6 +30,9 @@ class ScenePointOptions:
     plane_excess: float = 1.25  # a plane wider than the part by this factor is what it stands on
     max_planes: int = 3  # planes that are removed
     min_points: int = 200  # points that a cloud needs
+    flat_variation: float = 0.05  # least eigenvalue, as a share of all, below which neighbours lie on a surface
+    min_flat: float = 0.005  # share of such neighbourhoods below which the points lie on no surface
+    min_flat_points: int = 1000  # points from which this is asked
     seed: int = 0
 
 
@@ -75,6 +78,11 @@ def scene_points(
     kept = ~_strays(points, o)
     points = points[kept]
     own = normals[kept] if has_normals and normals is not None else None
+    if len(points) >= o.min_flat_points and _flat_share(points, o) < o.min_flat:
+        raise InputError(
+            "cloud: its points lie on no surface, so the part is not in it; is it the right file, and are its columns "
+            "x, y, z?"
+        )
     estimated = _normals(points, o)
     is_oriented = False
     if own is not None:
@@ -163,6 +171,15 @@ def _strays(points: Array, o: ScenePointOptions) -> Flags:
     out = np.ones(len(points), dtype=bool)
     out[np.asarray(kept)] = False
     return out
+
+
+def _flat_share(points: Array, o: ScenePointOptions) -> float:
+    """Share of some points whose neighbours lie on a surface, by the surface variation of Pauly et al. (2002)."""
+    few = np.random.default_rng(o.seed).permutation(len(points))[:1000]
+    _, near = cKDTree(points).query(points[few], k=o.normal_neighbours)
+    around = points[near] - points[near].mean(axis=1, keepdims=True)
+    sizes = np.linalg.eigvalsh(np.einsum("nki,nkj->nij", around, around))
+    return float(np.mean(sizes[:, 0] <= o.flat_variation * sizes.sum(axis=1)))
 
 
 def _normals(points: Array, o: ScenePointOptions) -> Array:

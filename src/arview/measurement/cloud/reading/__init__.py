@@ -2,6 +2,15 @@
 
 from arview.measurement.cloud.reading.files import SUFFIXES, read_points
 from arview.measurement.cloud.reading.raw_points import RawPoints, ReadOptions
-from arview.measurement.cloud.reading.units import UNITS_MM, possible_units, unit_of_option
+from arview.measurement.cloud.reading.units import (
+    UNITS_MM,
+    USUAL_UNITS,
+    check_given_unit,
+    possible_units,
+    unit_of_option,
+)
 
-__all__ = ["SUFFIXES", "UNITS_MM", "RawPoints", "ReadOptions", "possible_units", "read_points", "unit_of_option"]
+__all__ = [
+    "SUFFIXES", "UNITS_MM", "USUAL_UNITS", "RawPoints", "ReadOptions", "check_given_unit", "possible_units",
+    "read_points", "unit_of_option",
+]  # fmt: skip
