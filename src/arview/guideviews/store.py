@@ -77,7 +77,8 @@ def read_arrays(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
         raise InputError(f"{path}: the guide-view set is damaged; make it again with `arview guideviews`") from error
     damaged = f"{path}: the guide-view set is damaged; make it again with `arview guideviews`"
     start = len(_MAGIC) + 8 + length
-    mapped = np.memmap(path, dtype=np.uint8, mode="r")
+    # As a plain array, still mapped: slices of a memmap are slow, and views are made of many of them.
+    mapped = np.memmap(path, dtype=np.uint8, mode="r").view(np.ndarray)
     arrays = {}
     try:
         meta, layout = dict(header["meta"]), dict(header["arrays"])
