@@ -18,7 +18,7 @@ from typing import Generic, Protocol, TypeVar
 
 from arview.camera import Camera
 from arview.core.checks import check_type
-from arview.errors import OutputError
+from arview.errors import OutputError, is_interruption
 from arview.pose import Completeness, Pose, Presence
 from arview.pose_file import PoseWriter
 from arview.tracking.self_calibration.estimator import FocalEstimate
@@ -178,7 +178,9 @@ def annotate(
                 counts.add(poses)
                 if progress:
                     progress(len(counts.ms), poses[0])
-        except KeyboardInterrupt:
+        except (KeyboardInterrupt, SystemError) as error:
+            if not is_interruption(error):
+                raise
             counts.is_interrupted = True
         outputs.finish_drawing()
         if not counts.ms and not counts.is_interrupted:

@@ -185,7 +185,7 @@ Ctrl-C ends the run and finishes the files.""",
 @click.argument("source")
 @click.option("--part", "part_paths", required=True, multiple=True, metavar="PART",
               help="Part file or CAD file; again for further parts.")  # fmt: skip
-@click.option("--instances", type=click.IntRange(min=1), default=1, metavar="N", help="Specimens of each part in view.")
+@click.option("--instances", type=click.IntRange(1, 16), default=1, metavar="N", help="Specimens of each part in view.")
 @click.option("--guideviews", "views_path", metavar="SET", help="Guide views; default: rendered and cached.")
 @click.option("--camera", "camera_spec", metavar="CAMERA", help="See below; without it the camera is guessed.")
 @click.option("--save-profile", "profile", metavar="NAME", help="Keep the estimated camera as a profile; see below.")

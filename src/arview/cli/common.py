@@ -19,7 +19,7 @@ import click
 from arview.cli.exit_codes import ExitCode, help_rows
 from arview.core.atomic import is_device
 from arview.core.progress import Progress, StepProgress
-from arview.errors import ArviewError, CannotMeasureError, InputError, OutputError, without_credentials
+from arview.errors import ArviewError, CannotMeasureError, InputError, OutputError, is_interruption, without_credentials
 from arview.version import __version__
 
 if TYPE_CHECKING:
@@ -80,7 +80,9 @@ class _Program(Group):
         try:
             with _closed_pipe_exits():
                 return super().invoke(ctx)
-        except KeyboardInterrupt:
+        except (KeyboardInterrupt, SystemError) as error:
+            if not is_interruption(error):
+                raise
             say("interrupted")
             ctx.exit(ExitCode.INTERRUPTED)
 

@@ -151,7 +151,7 @@ seconds.""",
 )
 @click.option("--part", "part_paths", required=True, multiple=True, metavar="PART",
               help="Part file or CAD file; again for further parts.")  # fmt: skip
-@click.option("--instances", type=click.IntRange(min=1), default=1, metavar="N", help="Specimens of each part in view.")
+@click.option("--instances", type=click.IntRange(1, 16), default=1, metavar="N", help="Specimens of each part in view.")
 @click.option("--guideviews", "views_path", metavar="SET", help="Guide views; default: rendered and cached.")
 @click.option("--inspection", "inspection_paths", multiple=True, metavar="FILE",
               help="inspection.json whose values are shown; again for further specimens, in their order.")  # fmt: skip

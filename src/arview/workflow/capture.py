@@ -22,7 +22,7 @@ from arview.capture import CaptureAdvice, CaptureGuide, CaptureOptions
 from arview.capture.information import focal_px
 from arview.capture.options import TriggerOptions
 from arview.core.atomic import write_file
-from arview.errors import OutputError
+from arview.errors import OutputError, is_interruption
 from arview.pose import Pose
 from arview.reconstruction.run import camera_summary
 from arview.version import __version__
@@ -150,7 +150,9 @@ def capture_photos(
                 progress(frames, advice)
             if advice.is_enough:
                 break
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, SystemError) as error:
+        if not is_interruption(error):
+            raise
         is_interrupted = True
     if photos:
         job.end()
