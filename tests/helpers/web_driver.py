@@ -178,6 +178,29 @@ class Firefox:
     def screenshot(self) -> Image:
         return _decoded(base64.b64decode(self._ask("WebDriver:TakeScreenshot", {"full": False})["value"]))
 
+    def send_keys(self, selector: str, text: str) -> None:
+        """Type into an element; into a choice of files: their paths."""
+        found = self._ask("WebDriver:FindElement", {"using": "css selector", "value": selector})["value"]
+        self._ask("WebDriver:ElementSendKeys", {"id": next(iter(found.values())), "text": text})
+
+    def press_keys(self, *keys: str) -> None:
+        """Press keys one after another and hold them, then let go."""
+        actions = [{"type": kind, "value": key} for kind in ("keyDown", "keyUp") for key in keys]
+        self._ask("WebDriver:PerformActions", {"actions": [{"type": "key", "id": "keys", "actions": actions}]})
+
+    def drag_mouse(self, *way: tuple[float, float], key: str = "") -> None:
+        """Press at the first place, px, move along the others and let go; one place is a click. A key may be held."""
+        moves = [{"type": "pointerMove", "x": round(x), "y": round(y), "duration": 60} for x, y in way]
+        press, release = ({"type": kind, "button": 0} for kind in ("pointerDown", "pointerUp"))
+        mouse = [moves[0], press, *moves[1:], release]
+        pauses = [{"type": "pause"}] * (len(mouse) - 2)
+        held = [{"type": "keyDown", "value": key}, *pauses, {"type": "pause"}, {"type": "keyUp", "value": key}]
+        sources = [{"type": "pointer", "id": "mouse", "parameters": {"pointerType": "mouse"}, "actions": mouse}]
+        if key:
+            sources.append({"type": "key", "id": "keys", "actions": held})
+        self._ask("WebDriver:PerformActions", {"actions": sources})
+        self._ask("WebDriver:ReleaseActions", {})
+
     def _ask(self, command: str, about: dict[str, Any]) -> Any:
         self._count += 1
         message = json.dumps([0, self._count, command, about]).encode()

@@ -52,8 +52,8 @@ class Assessment:
             "is_sufficient": unique.is_sufficient,
             "reason": unique.reason,
             "score": unique.score,
-            "plain_share": float(np.mean([word == "plain" for word in weak])),
-            "confusable_share": float(np.mean([word == "alike" for word in weak])),
+            "plain_share": float(np.mean(unique.distinct_lines < PLAIN_LINES)),
+            "confusable_share": float(np.mean(unique.likeness >= CONFUSABLE_LIKENESS)),
             "most_alike": confusable_pair(views, unique),
             "look_alikes": [vars(one) for one in self.look_alikes],
             "views": [
