@@ -136,7 +136,12 @@ def test_from_a_bare_step_file_to_a_tracked_clip(browser: Firefox, tmp_path: Pat
         assert datums["C"]["point_mm"] == pytest.approx([97.0, -67.0, 0.0], abs=1e-4)
 
         page.tab("Range")
-        wanted = {"distance_mm": (400, 660), "elevation_deg": (20, 68), "azimuth_deg": (-160, 30), "roll_deg": (-30, 30)}
+        wanted = {
+            "distance_mm": (400, 660),
+            "elevation_deg": (20, 68),
+            "azimuth_deg": (-160, 30),
+            "roll_deg": (-30, 30),
+        }
         for key, ends in wanted.items():
             for side, value in enumerate(ends):
                 page.fill(f'[data-key="{key}-{side}"]', f"{value}")
