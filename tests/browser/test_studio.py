@@ -39,7 +39,7 @@ def become(offered: Any, feature: str, label: str) -> None:
     offered.filter(has_text=feature).first.locator(f'[data-label="{label}"]').click()
 
 
-def put_range(page: StudioPage, **intervals: tuple[float, float]) -> None:
+def put_range(page: StudioPage, **intervals: tuple[float, ...]) -> None:
     for key, ends in intervals.items():
         for side, value in enumerate(ends):
             control = page.page.locator(f'[data-key="{key}-{side}"]')

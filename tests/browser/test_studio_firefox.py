@@ -191,7 +191,8 @@ def test_from_a_bare_step_file_to_a_tracked_clip(browser: Firefox, tmp_path: Pat
 def drag_greatest_azimuth(page: Page, azimuth_deg: float) -> None:
     """Drag that border of the shell to an azimuth, at the height where its handle is."""
     left, top, width, height = page.browser.run(
-        "const one = [...document.querySelectorAll('[role=slider]')].find((one) => one.ariaLabel === 'Greatest azimuth');"
+        "const all = [...document.querySelectorAll('[role=slider]')];"
+        " const one = all.find((one) => one.ariaLabel === 'Greatest azimuth');"
         " const { left, top, width, height } = one.getBoundingClientRect(); return [left, top, width, height];"
     )
     azimuth, elevation = np.deg2rad([azimuth_deg, 44.0])
