@@ -46,6 +46,10 @@ With 16 photos or more, two interleaved halves of them are adjusted and measured
 compares them with their U. Where they differ by more, U is enlarged. --no-repeatability leaves this out.
 
 \b
+--masks auto is for a part that moves against its background, see `arview reconstruct --help`. Components
+are measured in the whole photos: masks never hide one that is displaced.
+
+\b
 A video or PDF that cannot be made is a warning: the verdict stands without it.""",
     exit_codes={
         ExitCode.DONE: "pass: every component passes or has no tolerance, and there is no foreign object",
@@ -69,7 +73,8 @@ A video or PDF that cannot be made is a warning: the verdict stands without it."
 @click.option("--camera", metavar="CAMERA", help="Calibrated camera file of the photos, or fov:DEG.")
 @click.option("--video-camera", metavar="CAMERA", help="The same for the video, if it was taken with another camera.")
 @click.option("--scale-file", metavar="FILE", help="TOML file of the boards, tags, scale bars and rig in view.")
-@click.option("--masks", metavar="FOLDER", help="Masks as IMAGE.png, black where a photo is not to be used.")
+@click.option("--masks", metavar="FOLDER|auto",
+              help="Masks as IMAGE.png, black where a photo is not to be used; auto: the CAD's silhouette.")  # fmt: skip
 @click.option("--sparse", metavar="FOLDER|FILE",
               help="Camera poses made elsewhere: COLMAP model, Metashape XML or transforms.json.")  # fmt: skip
 @click.option("--pairs", metavar="FILE",

@@ -47,6 +47,13 @@ The scale comes from what is known, in this order of trust; several sources are 
                                       show that it is not
 
 \b
+--masks auto is for a part that moves against its background (a turntable, a part held in the hand). If
+the photos cannot be placed, or the CAD contradicts their poses, the part is detected in each photo, and
+they are placed by its pixels alone. Otherwise the poses stand and the masks limit the dense cloud. They
+reach 10 mm beyond the silhouette. If the part is not found, a warning says why and no masks are used.
+A folder named auto is given as ./auto.
+
+\b
 OUT holds the files of every stage: photos.json, sparse/ (COLMAP model, points.ply), scale.json, metric/
 (COLMAP model in mm in the frame of the CAD), dense/ (depth maps in COLMAP's format), cloud.ply and
 reconstruction.json. An interrupted run resumes where it stopped; --force starts over.""",
@@ -63,7 +70,8 @@ reconstruction.json. An interrupted run resumes where it stopped; --force starts
 @click.option("--rig", metavar="FILE", help="Known camera poses in mm.")
 @click.option("--sparse", "poses", metavar="FOLDER|FILE",
               help="Camera poses made elsewhere: COLMAP model, Metashape XML or transforms.json.")  # fmt: skip
-@click.option("--masks", metavar="FOLDER", help="Masks as IMAGE.png, black where a photo is not to be used.")
+@click.option("--masks", metavar="FOLDER|auto",
+              help="Masks as IMAGE.png, black where a photo is not to be used; auto: the CAD's silhouette, see below.")  # fmt: skip
 @click.option("--until", type=click.Choice(STAGES), default="dense", show_default=True, help="Last stage to do.")
 @click.option("--band", type=click.FloatRange(min=0.1), default=5.0, show_default=True, metavar="MM",
               help="Distance of components from their nominal place that the dense stage covers.")  # fmt: skip
@@ -105,13 +113,17 @@ def reconstruct(
     from arview.reconstruction import run
     from arview.reconstruction.dense import DenseOptions
     from arview.reconstruction.intake import VideoIntakeOptions
+    from arview.reconstruction.part_masks import AUTO
     from arview.reconstruction.sparse import SparseOptions
+    from arview.workflow.silhouettes import CadSilhouettes
 
     folder = Path(output)
     if folder.exists() and not folder.is_dir():
         raise InputError(f"{output}: is a file; give a folder for the results")
     if Path(source).is_dir() and folder.resolve() == Path(source).resolve():
         raise InputError(f"{output}: is the folder of the photos; give another one for the results")
+    if masks == AUTO and part_path is None:
+        raise InputError("--masks auto masks by the CAD's silhouette; give the CAD with --part, or a folder of masks")
     part = load_part(part_path, unit) if part_path else None
     options = run.ReconstructOptions(
         video=VideoIntakeOptions(max_frames=max_frames),
@@ -119,7 +131,8 @@ def reconstruct(
         sources=_sources(boards, tags, bars, scale_file, rig),
         dense=DenseOptions(seed=seed, band_mm=band, threads=threads, device=device),
         poses=Path(poses) if poses else None,
-        masks=Path(masks) if masks else None,
+        masks=Path(masks) if masks and masks != AUTO else None,
+        silhouettes=CadSilhouettes(part) if masks == AUTO and part is not None else None,
         last_stage=get_args(run.StageName)[STAGES.index(until)],
         starts_over=force,
     )

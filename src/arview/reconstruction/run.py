@@ -5,6 +5,7 @@
 | ``photos.json`` | intake: checks of each photo, and which were rejected and why |
 | ``frames/`` | the chosen frames, of a video |
 | ``sparse/model/``, ``sparse/database.db`` | COLMAP model in its own unit, features and matches |
+| ``silhouettes/`` | masks of the part, where they were made of its CAD |
 | ``sparse/points.ply``, ``sparse/covariance.npy`` | its points; covariance of the poses, see `SparseModel` |
 | ``scale.json`` | mm per unit and approximate CAD frame, with the evidence |
 | ``metric/`` | the COLMAP model in mm in the approximate CAD frame |
@@ -49,6 +50,7 @@ from arview.reconstruction.intake.masks import with_masks
 from arview.reconstruction.intake.sensor import share_lenses
 from arview.reconstruction.memory import SparseMemory
 from arview.reconstruction.pairs import KnownPairs
+from arview.reconstruction.part_masks import Silhouettes, placed_with_silhouettes, with_masks_of
 from arview.reconstruction.quality import Quality, quality_of
 from arview.reconstruction.scale import CadOptions, ScaleResult, ScaleSources, find_scale
 from arview.reconstruction.sparse import SparseOptions, reconstruct_from_poses, reconstruct_sparse
@@ -81,6 +83,7 @@ class ReconstructOptions:
     dense: DenseOptions = field(default_factory=DenseOptions)
     poses: Path | None = None  # camera poses made elsewhere, see `given_poses`; None: structure from motion
     masks: Path | None = None  # folder with a mask for each photo, black where it is not to be used
+    silhouettes: Silhouettes | None = None  # makes masks of the part where there are none, see `part_masks`
     known: KnownPairs = field(
         default_factory=KnownPairs
     )  # pairs of photos to be matched, or rough poses to choose them
@@ -181,6 +184,8 @@ class _ReconstructionRun:
             key = key_of(key, self.options.known.key())
             if self.options.poses is not None:
                 key = key_of(key, [(one.name, one.cam_from_scan.tolist()) for one in read_poses(self.options.poses)])
+            if self.options.silhouettes is not None:
+                key = key_of(key, self.options.silhouettes.key())
             sparse = self._sparse(intake.photos, key)
         if last >= 2 and sparse is not None:
             part_key = None if self.part is None else (self.part.model.source_hash, self.part.effective_view_range)
@@ -243,13 +248,23 @@ class _ReconstructionRun:
         if self.stages.is_finished("sparse", key):
             return _read_sparse(folder, photos)
         self._restart("sparse")
-        sparse = self._placed(photos, folder)
+        sparse = self._placed_and_masked(photos, folder)
         write_sparse(folder, sparse)
         self.stages.finish("sparse", key)
         self._record_time("sparse", began)
         return sparse
 
-    def _placed(self, photos: tuple[Photo, ...], folder: Path) -> SparseModel:
+    def _placed_and_masked(self, photos: tuple[Photo, ...], folder: Path) -> SparseModel:
+        """The placed photos, with masks of the part where these are wished for."""
+        silhouettes = self.options.silhouettes
+        if silhouettes is None:
+            return self._placed(photos, folder)
+        return placed_with_silhouettes(
+            photos, folder, self.folder / "silhouettes", silhouettes, self._placed, self.tell,
+            can_place_again=self.options.poses is None,
+        )  # fmt: skip
+
+    def _placed(self, photos: Sequence[Photo], folder: Path) -> SparseModel:
         """The photos placed by structure from motion, or by the poses that were given."""
         if self.options.poses is None:
             return reconstruct_sparse(photos, folder, self.options.sparse, self.tell, self.options.known, self.memory)
@@ -308,6 +323,10 @@ class _ReconstructionRun:
 def write_sparse(folder: Path, sparse: SparseModel) -> None:
     """Write what COLMAP's model, which is already in the folder, does not contain."""
     write_json(folder / "unplaced.json", dict(sparse.unplaced))
+    made = folder.parent / "silhouettes"  # masks that were given are found again by intake
+    masks = {photo.name: photo.mask for photo in sparse.photos if photo.mask is not None}
+    names = {name: path.relative_to(made).as_posix() for name, path in masks.items() if path.is_relative_to(made)}
+    write_json(folder / "silhouettes.json", names)
     write_json(
         folder / "groups.json", {"groups": [list(one) for one in sparse.groups], "remarks": list(sparse.remarks)}
     )
@@ -330,8 +349,25 @@ def _read_sparse(folder: Path, photos: tuple[Photo, ...]) -> SparseModel:
     except (OSError, ValueError, RuntimeError) as error:
         raise InputError(f"{folder}: files are missing or damaged ({error}); run again with --force") from error
     sparse = replace(sparse, groups=tuple(tuple(group) for group in groups["groups"]), remarks=tuple(groups["remarks"]))
+    sparse = with_masks_of(sparse, _read_silhouettes(folder))
     path = folder / "covariance.npy"
     return replace(sparse, pose_covariance=np.load(path)) if path.exists() else sparse
+
+
+def _read_silhouettes(folder: Path) -> dict[str, Path]:
+    """The masks that an earlier run made, by the names of their photos. Raises InputError when files are missing."""
+    path = folder / "silhouettes.json"
+    if not path.is_file():  # written by arview before it made masks
+        return {}
+    try:
+        names = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: is damaged ({error}); run again with --force") from error
+    masks = {photo: folder.parent / "silhouettes" / name for photo, name in names.items()}
+    absent = next((mask for mask in masks.values() if not mask.is_file()), None)
+    if absent is not None:
+        raise InputError(f"{absent}: the mask is missing; run again with --force")
+    return masks
 
 
 def points_ply(sparse: SparseModel) -> bytes:
@@ -387,6 +423,7 @@ def summary(result: Reconstruction) -> dict[str, Any]:
             photo.name: {
                 "camera": camera_summary(photo.camera),
                 "cam_from_scan": photo.cam_from_scan.tolist(),
+                **({} if photo.mask is None else {"mask": str(photo.mask)}),
                 **({} if deviations is None else {"std_rad": deviations[i, 0], "std_position": deviations[i, 1]}),
             }
             for i, photo in enumerate(sparse.photos)

@@ -28,7 +28,7 @@ class InspectJob:
     video_camera: str | None = None
     scale_file: str | None = None
     unit: str | None = None
-    masks: str | None = None  # folder of masks of the photos, black where a photo is not to be used
+    masks: str | None = None  # folder of masks, black where a photo is not to be used; auto: the CAD's silhouettes
     sparse: str | None = None  # camera poses made elsewhere: COLMAP model, Metashape XML or transforms.json
     tolerance_mm: float | None = None  # tolerance of components without one in the part file
     guard: float = 1.0  # fraction of U by which the tolerance is reduced; 1: ISO 14253-1

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from arview.errors import InputError
+from arview.reconstruction.part_masks import AUTO
 from arview.workflow.job import InspectJob
 from arview.workflow.storage import is_url, join_location
 
@@ -100,7 +101,8 @@ def _job(values: dict[str, Any], base: Path, place: str) -> InspectJob:
             raise InputError(
                 f"{place}: {key}: {value!r}, expected {'a number' if kind in (int, float) else kind.__name__}"
             )
-        if key in LOCATION_FIELDS and not (key.endswith("camera") and value.startswith("fov:")):
+        is_word = (key.endswith("camera") and value.startswith("fov:")) or (key == "masks" and value == AUTO)
+        if key in LOCATION_FIELDS and not is_word:
             values[key] = _placed(value, base)
     return InspectJob(**values)
 

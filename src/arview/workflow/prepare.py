@@ -16,6 +16,7 @@ from arview.reconstruction.given_poses import read_poses
 from arview.reconstruction.intake import VideoIntakeOptions
 from arview.reconstruction.intake.reading import photo_paths
 from arview.reconstruction.pairs import KnownPairs, read_pairs
+from arview.reconstruction.part_masks import AUTO
 from arview.reconstruction.run import ReconstructOptions
 from arview.reconstruction.scale import ScaleSources, load_scale_file
 from arview.reconstruction.sparse import SparseOptions
@@ -23,6 +24,7 @@ from arview.version import __version__
 from arview.video import open_source
 from arview.video.intrinsics import load_camera_of
 from arview.workflow.job import InspectJob
+from arview.workflow.silhouettes import CadSilhouettes
 
 
 @dataclass(frozen=True)
@@ -58,8 +60,8 @@ def prepare(job: InspectJob, folder: Path) -> Prepared:
         part = replace(part, serial=job.serial)
     if not part.inspected:
         raise InputError(f"part {part.name!r}: no component has the role 'inspect'")
-    if job.masks and not Path(job.masks).is_dir():
-        raise InputError(f"{job.masks}: no such folder; give the folder of the masks")
+    if job.masks and job.masks != AUTO and not Path(job.masks).is_dir():
+        raise InputError(f"{job.masks}: no such folder; give the folder of the masks, or auto")
     if job.sparse:
         read_poses(job.sparse)
     _check_cameras(job)
@@ -70,7 +72,8 @@ def prepare(job: InspectJob, folder: Path) -> Prepared:
         sources=load_scale_file(job.scale_file) if job.scale_file else ScaleSources(),
         dense=DenseOptions(seed=seed, threads=threads, device=job.device),
         poses=Path(job.sparse) if job.sparse else None,
-        masks=Path(job.masks) if job.masks else None,
+        masks=Path(job.masks) if job.masks and job.masks != AUTO else None,
+        silhouettes=CadSilhouettes(part) if job.masks == AUTO else None,
         known=read_pairs(job.pairs) if job.pairs else KnownPairs(),
     )
     measure = MeasureOptions(
@@ -99,14 +102,16 @@ def measurement_key(prepared: Prepared) -> str:
     job, part, options = prepared.job, prepared.part, prepared.measure
     source = Path(job.photo_source)
     photos = [source] if source.is_file() else photo_paths(job.photo_source)[0]
-    masks = sorted(Path(job.masks).rglob("*.png")) if job.masks else []
+    reconstruct = prepared.reconstruct
+    masks = [] if reconstruct.masks is None else sorted(reconstruct.masks.rglob("*.png"))
+    made = None if reconstruct.silhouettes is None else reconstruct.silhouettes.key()
     poses = [(one.name, one.cam_from_scan.tolist()) for one in read_poses(job.sparse)] if job.sparse else []
     return key_of(
-        content_key(photos), content_key(masks), poses, job.compares_halves, _content(job.camera),
+        content_key(photos), content_key(masks), made, poses, job.compares_halves, _content(job.camera),
         part.model.source_hash, part.name, part.settings,
         part.datums, part.serial, part.effective_view_range, replace(options, maps_folder=None),
-        replace(prepared.reconstruct, masks=None, poses=None, sparse=replace(prepared.reconstruct.sparse, threads=0),
-                dense=replace(prepared.reconstruct.dense, threads=0)), __version__,
+        replace(reconstruct, masks=None, silhouettes=None, poses=None, sparse=replace(reconstruct.sparse, threads=0),
+                dense=replace(reconstruct.dense, threads=0)), __version__,
     )  # fmt: skip
 
 

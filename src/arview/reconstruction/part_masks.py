@@ -1,0 +1,159 @@
+"""Masks that are made of the part itself: where they come from, and how the photos are placed with them.
+
+Poses come from whatever most features belong to. A background that stands still beside the part helps them, and is
+kept: the silhouettes then limit the dense cloud only. Where the background moves against the part, the photos are
+not placed, or placed such that the part contradicts the poses. They are then placed again by the part's pixels alone.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Protocol
+
+from arview.core.progress import Progress
+from arview.errors import CannotMeasureError, OutputError
+from arview.reconstruction.types import Photo, SparseModel
+
+AUTO = "auto"
+"""What ``--masks`` is given instead of a folder to have the masks made."""
+
+
+@dataclass(frozen=True)
+class PartMasks:
+    """Masks of photos.
+
+    Attributes:
+        masks: file of the mask of each masked photo, by the name of the photo; empty if there are none.
+        detail: what was masked and with which margin; or why there are no masks.
+    """
+
+    detail: str
+    masks: Mapping[str, Path] = field(default_factory=dict)
+
+
+class Silhouettes(Protocol):
+    """Makes masks from the outline of the part. It lives in a room that knows CAD, rendering and detection."""
+
+    def key(self) -> str:
+        """What the masks depend on beside the photos, as a hash."""
+
+    def at_poses(self, sparse: SparseModel, folder: Path, tell: Progress) -> PartMasks:
+        """Masks of the placed photos, with the part found at their poses; none if it contradicts them."""
+
+    def in_photos(self, photos: Sequence[Photo], folder: Path, tell: Progress) -> PartMasks:
+        """Masks of the photos in which the part is found, each by itself, without poses."""
+
+
+@dataclass(frozen=True)
+class PlacingOptions:
+    """When photos are placed again by the part alone."""
+
+    min_placed: float = 0.7  # share of the photos; with fewer, the background may hold the others back
+    min_found: int = 3  # photos in which the part was found; fewer cannot be placed together
+
+
+def placed_with_silhouettes(
+    photos: Sequence[Photo], folder: Path, masks_folder: Path, silhouettes: Silhouettes,
+    place: Callable[[Sequence[Photo], Path], SparseModel], tell: Progress, can_place_again: bool = True,
+    options: PlacingOptions | None = None,
+) -> SparseModel:  # fmt: skip
+    """The placed photos with masks of the part; or without masks where the part is not found, with a remark.
+
+    Args:
+        photos: without masks.
+        folder: of the files of the sparse model.
+        masks_folder: where the masks are written.
+        silhouettes: makes the masks.
+        place: places photos and leaves files in a folder; raises CannotMeasureError.
+        tell: called with (what, done, total).
+        can_place_again: False where the poses were given.
+        options: see `PlacingOptions`.
+
+    Raises:
+        CannotMeasureError: the photos cannot be placed, neither whole nor by the part.
+    """
+    options = options or PlacingOptions()
+    whole, failure = None, None
+    try:
+        whole = place(photos, folder)
+    except CannotMeasureError as error:
+        if not can_place_again:
+            raise
+        failure = error
+    reason = "the whole photos could not be placed"
+    if whole is not None:
+        found = silhouettes.at_poses(whole, masks_folder, tell)
+        count = len(whole.photos)
+        is_enough = count >= options.min_placed * len(photos)
+        if found.masks and (is_enough or not can_place_again):
+            return _with_remark(with_masks_of(whole, found.masks), f"masks from the CAD's silhouette: {found.detail}")
+        reason = f"only {count} of {len(photos)} photos were placed whole" if found.masks else found.detail
+    if not can_place_again:
+        assert whole is not None
+        return _with_remark(whole, _not_made(reason))
+    return _placed_by_part(photos, folder, masks_folder, silhouettes, place, tell, options, whole, failure, reason)
+
+
+def _placed_by_part(
+    photos: Sequence[Photo], folder: Path, masks_folder: Path, silhouettes: Silhouettes,
+    place: Callable[[Sequence[Photo], Path], SparseModel], tell: Progress, options: PlacingOptions,
+    whole: SparseModel | None, failure: CannotMeasureError | None, reason: str,
+) -> SparseModel:  # fmt: skip
+    """The photos placed by the pixels of the part alone; as they were placed before where that places no more."""
+    found = silhouettes.in_photos(photos, masks_folder, tell)
+    masked = [replace(photo, mask=found.masks[photo.name]) for photo in photos if photo.name in found.masks]
+    problem = found.detail
+    if len(masked) >= options.min_found:
+        try:
+            sparse = _placed_apart(masked, folder, place, 0 if whole is None else len(whole.photos))
+        except CannotMeasureError as error:
+            problem = f"{found.detail}; placed by the part alone: {error}"
+        else:
+            left_out = [(one.name, "the part was not found in it, so that it has no silhouette (--masks auto)")
+                        for one in photos if one.name not in found.masks]  # fmt: skip
+            remark = f"masks from the CAD's silhouette: placed by the part alone, because {reason}; {found.detail}"
+            return _with_remark(replace(sparse, unplaced=(*sparse.unplaced, *left_out)), remark)
+    if whole is None:
+        raise CannotMeasureError(f"{failure}; --masks auto does not help: {problem}") from failure
+    return _with_remark(whole, _not_made(f"{reason}; {problem}"))
+
+
+def _placed_apart(
+    photos: Sequence[Photo], folder: Path, place: Callable[[Sequence[Photo], Path], SparseModel], min_photos: int
+) -> SparseModel:
+    """The photos placed in a folder of their own, which then takes the place of ``folder``.
+
+    Raises:
+        CannotMeasureError: they cannot be placed, or fewer than ``min_photos``; ``folder`` is then as it was.
+    """
+    apart = folder.with_name(f"{folder.name}_by_part")
+    shutil.rmtree(apart, ignore_errors=True)
+    try:
+        sparse = place(photos, apart)
+        if len(sparse.photos) < min_photos:
+            raise CannotMeasureError(f"only {len(sparse.photos)} photos")
+        shutil.rmtree(folder, ignore_errors=True)
+        apart.replace(folder)
+    except OSError as error:
+        raise OutputError(f"{folder}: cannot be written to ({error.strerror or error})") from error
+    finally:
+        shutil.rmtree(apart, ignore_errors=True)
+    return sparse
+
+
+def with_masks_of(sparse: SparseModel, masks: Mapping[str, Path]) -> SparseModel:
+    """The model with the masks of its photos, by their names."""
+    return replace(
+        sparse, photos=tuple(replace(photo, mask=masks.get(photo.name, photo.mask)) for photo in sparse.photos)
+    )
+
+
+def _not_made(reason: str) -> str:
+    return f"no masks from the CAD's silhouette, the photos are used whole: {reason}"
+
+
+def _with_remark(sparse: SparseModel, remark: str) -> SparseModel:
+    return replace(sparse, remarks=(*sparse.remarks, remark))
