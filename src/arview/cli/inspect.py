@@ -74,7 +74,7 @@ A video or PDF that cannot be made is a warning: the verdict stands without it."
 @click.option("--video-camera", metavar="CAMERA", help="The same for the video, if it was taken with another camera.")
 @click.option("--scale-file", metavar="FILE", help="TOML file of the boards, tags, scale bars and rig in view.")
 @click.option("--masks", metavar="FOLDER|auto",
-              help="Masks as IMAGE.png, black where a photo is not to be used; auto: the CAD's silhouette.")  # fmt: skip
+              help="Masks as IMAGE.png, black where a photo is not to be used; auto: made of the CAD.")  # fmt: skip
 @click.option("--sparse", metavar="FOLDER|FILE",
               help="Camera poses made elsewhere: COLMAP model, Metashape XML or transforms.json.")  # fmt: skip
 @click.option("--pairs", metavar="FILE",

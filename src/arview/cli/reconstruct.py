@@ -71,7 +71,7 @@ reconstruction.json. An interrupted run resumes where it stopped; --force starts
 @click.option("--sparse", "poses", metavar="FOLDER|FILE",
               help="Camera poses made elsewhere: COLMAP model, Metashape XML or transforms.json.")  # fmt: skip
 @click.option("--masks", metavar="FOLDER|auto",
-              help="Masks as IMAGE.png, black where a photo is not to be used; auto: the CAD's silhouette, see below.")  # fmt: skip
+              help="Masks as IMAGE.png, black where a photo is not to be used; auto: made of the CAD.")  # fmt: skip
 @click.option("--until", type=click.Choice(STAGES), default="dense", show_default=True, help="Last stage to do.")
 @click.option("--band", type=click.FloatRange(min=0.1), default=5.0, show_default=True, metavar="MM",
               help="Distance of components from their nominal place that the dense stage covers.")  # fmt: skip
