@@ -152,6 +152,9 @@ def test_masks_and_poses_are_found_beside_the_file(tmp_path: Path) -> None:
     found = load_jobs(path)[0].job
     assert (found.masks, found.sparse) == (str(tmp_path / "m"), "s3://poses/a")
     assert not found.compares_halves
+    for text, masks in (("auto", "auto"), ("./auto", str(tmp_path / "auto"))):
+        path.write_text(f'out = "o"\n[[job]]\n{job.replace("masks = " + chr(34) + "m", "masks = " + chr(34) + text)}')
+        assert load_jobs(path)[0].job.masks == masks
 
 
 @pytest.mark.parametrize(

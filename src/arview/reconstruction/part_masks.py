@@ -27,7 +27,7 @@ class PartMasks:
 
     Attributes:
         masks: file of the mask of each masked photo, by the name of the photo; empty if there are none.
-        detail: what was masked and with which margin; or why there are no masks.
+        detail: which photos and which of their pixels are used; or why there are no masks.
     """
 
     detail: str
@@ -41,10 +41,16 @@ class Silhouettes(Protocol):
         """What the masks depend on beside the photos, as a hash."""
 
     def at_poses(self, sparse: SparseModel, folder: Path, tell: Progress) -> PartMasks:
-        """Masks of the placed photos, with the part found at their poses; none if it contradicts them."""
+        """Masks for the cloud, with the part found at the poses of the photos; none if it contradicts them.
+
+        They reach so far beyond the part that displaced components are inside.
+        """
 
     def in_photos(self, photos: Sequence[Photo], folder: Path, tell: Progress) -> PartMasks:
-        """Masks of the photos in which the part is found, each by itself, without poses."""
+        """Masks for placing the photos in which the part is found, each by itself, without poses.
+
+        They leave out as much of the background as they can.
+        """
 
 
 @dataclass(frozen=True)
@@ -89,7 +95,11 @@ def placed_with_silhouettes(
         count = len(whole.photos)
         is_enough = count >= options.min_placed * len(photos)
         if found.masks and (is_enough or not can_place_again):
-            return _with_remark(with_masks_of(whole, found.masks), f"masks from the CAD's silhouette: {found.detail}")
+            return _with_remark(
+                with_masks_of(whole, found.masks),
+                f"masks from the CAD's silhouette: the cloud comes from {found.detail}; the camera poses come from the "
+                "whole photos",
+            )
         reason = f"only {count} of {len(photos)} photos were placed whole" if found.masks else found.detail
     if not can_place_again:
         assert whole is not None
@@ -105,17 +115,20 @@ def _placed_by_part(
     """The photos placed by the pixels of the part alone; as they were placed before where that places no more."""
     found = silhouettes.in_photos(photos, masks_folder, tell)
     masked = [replace(photo, mask=found.masks[photo.name]) for photo in photos if photo.name in found.masks]
-    problem = found.detail
+    problem = f"the part was found in {len(masked)} photos by itself" if masked else found.detail
     if len(masked) >= options.min_found:
         try:
             sparse = _placed_apart(masked, folder, place, 0 if whole is None else len(whole.photos))
         except CannotMeasureError as error:
-            problem = f"{found.detail}; placed by the part alone: {error}"
+            problem = f"the part was found in {len(masked)} photos, which could not be placed by it alone: {error}"
         else:
             left_out = [(one.name, "the part was not found in it, so that it has no silhouette (--masks auto)")
                         for one in photos if one.name not in found.masks]  # fmt: skip
-            remark = f"masks from the CAD's silhouette: placed by the part alone, because {reason}; {found.detail}"
-            return _with_remark(replace(sparse, unplaced=(*sparse.unplaced, *left_out)), remark)
+            sparse = replace(sparse, unplaced=(*sparse.unplaced, *left_out))
+            remark = f"masks from the CAD's silhouette: placed by the part alone, because {reason}; from {found.detail}"
+            wide = silhouettes.at_poses(sparse, masks_folder, tell)
+            remark += f"; the cloud comes from {wide.detail}" if wide.masks else ""
+            return _with_remark(with_masks_of(_unmasked(sparse), wide.masks), remark)
     if whole is None:
         raise CannotMeasureError(f"{failure}; --masks auto does not help: {problem}") from failure
     return _with_remark(whole, _not_made(f"{reason}; {problem}"))
@@ -145,10 +158,14 @@ def _placed_apart(
 
 
 def with_masks_of(sparse: SparseModel, masks: Mapping[str, Path]) -> SparseModel:
-    """The model with the masks of its photos, by their names."""
+    """The model with the masks of its photos, by their names; other photos keep theirs."""
     return replace(
         sparse, photos=tuple(replace(photo, mask=masks.get(photo.name, photo.mask)) for photo in sparse.photos)
     )
+
+
+def _unmasked(sparse: SparseModel) -> SparseModel:
+    return replace(sparse, photos=tuple(replace(photo, mask=None) for photo in sparse.photos))
 
 
 def _not_made(reason: str) -> str:

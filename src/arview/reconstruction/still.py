@@ -68,7 +68,7 @@ def still_remark(
     return (
         f"{100 * float(np.median(shares)):.0f} % of the features stand still in the picture while others move: a "
         "turntable, or a part that is moved before a camera on a stand; the still background is left out. Where the "
-        "part is still not placed, give masks (--masks)"
+        "part is still not placed, give masks (--masks auto, or a folder)"
     )
 
 

@@ -39,7 +39,7 @@ class SilhouetteOptions:
     """Size and margin of the masks, and how the part is found for them."""
 
     margin_mm: float = 10.0  # around the silhouette: twice the search range of the measurement and of the dense cloud
-    pose_share: float = 0.04  # of the part's diameter, added where the pose comes from one photo alone
+    placing_margin_mm: float = 0.0  # the same where photos are placed by the part alone: any background misleads them
     edge_px: float = 2.0  # added for the reduced size of the masks
     max_side_px: int = 1000  # longer side of the masks; they are scaled to their photos
     max_stretch: float = 3.0  # largest field of the undistorted view, relative to the photo
@@ -65,7 +65,7 @@ class CadSilhouettes:
             return PartMasks(f"the CAD was not found at the poses of the photos ({found.why_no_frame})")
         metric = sparse.transformed(found.scale, found.model_from_scan)
         poses = {photo.name: (photo.camera, photo.cam_from_scan) for photo in metric.photos}
-        return self._written(poses, folder, self.options.margin_mm, "", "the poses come from the whole photos")
+        return self._written(poses, folder, self.options.margin_mm)
 
     def in_photos(self, photos: Sequence[Photo], folder: Path, tell: Progress) -> PartMasks:
         """Masks of the photos in which the part is found, each by itself."""
@@ -89,12 +89,9 @@ class CadSilhouettes:
                     poses[photo.name] = (photo.camera, found[0].cam_from_model)
             if 2 * len(poses) >= len(photos):
                 break
-        margin_mm = self.options.margin_mm + self.options.pose_share * self.part.model.diameter_mm
-        return self._written(poses, folder, margin_mm, f"found in {len(poses)} of {len(photos)} photos; ", "")
+        return self._written(poses, folder, self.options.placing_margin_mm)
 
-    def _written(
-        self, poses: dict[str, tuple[Camera, Array]], folder: Path, margin_mm: float, before: str, after: str
-    ) -> PartMasks:
+    def _written(self, poses: dict[str, tuple[Camera, Array]], folder: Path, margin_mm: float) -> PartMasks:
         """The masks at poses ``cam_from_model``, as files; photos in which nothing of the part is seen have none."""
         masks: dict[str, Path] = {}
         shares: list[float] = []
@@ -112,12 +109,10 @@ class CadSilhouettes:
         except OSError as error:
             raise OutputError(f"{folder}: cannot be written to ({error.strerror or error})") from error
         if not masks:
-            return PartMasks(f"{before}the part was found in none of the photos")
-        detail = (
-            f"{before}{len(masks)} photos are used only where the part is or within {margin_mm:.0f} mm of it, "
-            f"{100 * float(np.median(shares)):.0f} % of their area"
-        )
-        return PartMasks(f"{detail}; {after}" if after else detail, masks)
+            return PartMasks("the part was found in none of the photos")
+        area = f"{100 * float(np.median(shares)):.0f} % of their area"
+        margin = f" or within {margin_mm:.0f} mm of it" if margin_mm > 0.0 else ""
+        return PartMasks(f"{len(masks)} photos, where the part is{margin} ({area})", masks)
 
 
 def silhouette_mask(
