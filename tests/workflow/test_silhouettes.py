@@ -96,7 +96,7 @@ def off_part_mm(found: Reconstruction) -> np.ndarray:
     assert found.sparse is not None and len(found.sparse.points_in_scan) > 300
     low, high = part_model().bounds_in_model
     points = found.sparse.points_in_scan
-    return np.linalg.norm(np.maximum(0.0, np.maximum(low - points, points - high)), axis=1)
+    return np.asarray(np.linalg.norm(np.maximum(0.0, np.maximum(low - points, points - high)), axis=1))
 
 
 def test_the_margin_covers_what_is_searched() -> None:
@@ -176,9 +176,9 @@ def test_masks_do_not_change_what_is_measured(tmp_path: Path) -> None:
     assert whole.cloud is not None and auto.cloud is not None and len(whole.cloud.points) > 50_000
     assert len(auto.cloud.points) == len(whole.cloud.points)
     for name in ("block_1", "block_2", "block_3", "block_4"):
-        one, other = (np.array(of_run[name].displacement_mm, dtype=float) for of_run in (without, masked))
+        here, there = (np.array(of_run[name].displacement_mm, dtype=float) for of_run in (without, masked))
         u_mm = masked[name].uncertainty_mm
-        assert np.isfinite(other).all() and u_mm is not None and np.linalg.norm(one - other) <= u_mm
+        assert np.isfinite(there).all() and u_mm is not None and np.linalg.norm(here - there) <= u_mm
     moved, u_mm = np.array(masked["block_2"].displacement_mm, dtype=float), masked["block_2"].uncertainty_mm
     assert u_mm is not None and np.linalg.norm(moved - MOVED_MM) <= max(u_mm, 0.1) and u_mm < 0.5
 

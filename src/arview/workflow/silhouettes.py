@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import cv2
@@ -40,7 +40,7 @@ class SilhouetteOptions:
 
     margin_mm: float = 10.0  # around the silhouette: twice the search range of the measurement and of the dense cloud
     placing_margin_mm: float = 0.0  # the same where photos are placed by the part alone: any background misleads them
-    edge_px: float = 2.0  # added for the reduced size of the masks
+    edge_px: float = 2.0  # added to ``margin_mm`` for the reduced size of the masks
     max_side_px: int = 1000  # longer side of the masks; they are scaled to their photos
     max_stretch: float = 3.0  # largest field of the undistorted view, relative to the photo
     # Rough placing is enough, because the margin covers its error.
@@ -93,12 +93,13 @@ class CadSilhouettes:
 
     def _written(self, poses: dict[str, tuple[Camera, Array]], folder: Path, margin_mm: float) -> PartMasks:
         """The masks at poses ``cam_from_model``, as files; photos in which nothing of the part is seen have none."""
+        options = self.options if margin_mm > 0.0 else replace(self.options, edge_px=0.0)
         masks: dict[str, Path] = {}
         shares: list[float] = []
         try:
             shutil.rmtree(folder, ignore_errors=True)
             for name, (camera, pose) in poses.items():
-                mask = silhouette_mask(self.part.model, pose, camera, margin_mm, self.options)
+                mask = silhouette_mask(self.part.model, pose, camera, margin_mm, options)
                 if not mask.any():
                     continue
                 path = folder / f"{name}.png"
@@ -133,7 +134,7 @@ def silhouette_mask(
     columns, rows = np.meshgrid(np.arange(small.width), np.arange(small.height))
     rays = small.unproject(np.stack([columns, rows], axis=-1).astype(np.float64))[..., :2]
     reach = options.max_stretch * np.array([small.width, small.height]) / (2.0 * np.array([small.fx, small.fy]))
-    in_field = np.isfinite(rays).all(axis=-1) & (np.abs(rays) <= reach).all(axis=-1)
+    in_field = np.asarray(np.isfinite(rays).all(axis=-1) & (np.abs(rays) <= reach).all(axis=-1))
     ideal = np.where(in_field[..., None], rays, 0.0) * (small.fx, small.fy)
     low, high = np.floor(ideal.min(axis=(0, 1))) - 1.0, np.ceil(ideal.max(axis=(0, 1))) + 1.0
     # What is outside of the photo by less than the margin has its margin inside.
