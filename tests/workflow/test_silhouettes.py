@@ -144,7 +144,7 @@ def test_a_part_before_a_moving_background_is_placed_by_itself(tmp_path: Path) -
     options = replace(OPTIONS, silhouettes=CadSilhouettes(part))
     found = reconstruct(photos, tmp_path / "auto", part, "fov:47", options)
     check_poses(found)
-    assert np.mean(off_part_mm(found) < 3.0) > 0.98  # nothing of the wall
+    assert np.mean(off_part_mm(found) < 3.0) > 0.95  # the rest are features on the outline, with wall beside it
     assert found.scale is not None and any("by the part alone" in one for one in found.scale.warnings)
     masks = sorted((tmp_path / "auto" / "silhouettes").glob("*.png"))
     assert len(masks) >= 14
@@ -180,7 +180,7 @@ def test_masks_do_not_change_what_is_measured(tmp_path: Path) -> None:
         u_mm = masked[name].uncertainty_mm
         assert np.isfinite(there).all() and u_mm is not None and np.linalg.norm(here - there) <= u_mm
     moved, u_mm = np.array(masked["block_2"].displacement_mm, dtype=float), masked["block_2"].uncertainty_mm
-    assert u_mm is not None and np.linalg.norm(moved - MOVED_MM) <= max(u_mm, 0.1) and u_mm < 0.5
+    assert np.linalg.norm(moved - MOVED_MM) < 0.2 and u_mm is not None and u_mm < 0.2  # a pixel is 0.6 mm
 
 
 def test_auto_folder_and_none_have_keys_of_their_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
