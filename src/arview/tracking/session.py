@@ -21,6 +21,7 @@ from arview.cad.model import Model
 from arview.camera import Camera
 from arview.camera.undistort import FrameView
 from arview.core.checks import check_type
+from arview.core.parallel import single_threaded_blas
 from arview.detection.detector import Detection, Detector, RejectedHypothesis, local_search_for
 from arview.detection.search.local_search import LocalSearch
 from arview.errors import MismatchError
@@ -148,7 +149,8 @@ class TrackingSession:
     def detector(self) -> Detector:
         """The detector, created when first needed."""
         if self._detector is None:
-            self._detector = Detector(self.views, self.camera, self.options.detector, local=self._local)
+            with single_threaded_blas():
+                self._detector = Detector(self.views, self.camera, self.options.detector, local=self._local)
         return self._detector
 
     @property
@@ -290,8 +292,7 @@ class TrackingSession:
         searched = searched_picture(image, self.others, covers, self.views, self.camera)
         detections = self._detect_remembered(searched) if is_resting else self._detect(searched, searches)
         detections = [one for one in detections if not self._is_other(one.cam_from_model)]
-        reason = ""
-        is_bare = o.use_base_detection and self.components.may_be_bare
+        reason, is_bare = "", o.use_base_detection and self.components.may_be_bare
         if detections:
             found = detections[0]
             if is_bare and s.state == TrackingState.LOST:
