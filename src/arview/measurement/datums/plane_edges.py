@@ -15,7 +15,7 @@ from arview.measurement.photo.edges import ComponentEdges, edge_offsets
 from arview.measurement.photo.fit import RigidFit, fit_rigid, move_rows
 from arview.measurement.photo.options import PhotoOptions
 from arview.measurement.photo.patches import tangents_of
-from arview.measurement.photo.rival_edges import EdgePoints, rival_px
+from arview.measurement.photo.rival_edges import EdgePoints, rival_offsets_px
 from arview.measurement.photo.views import PhotoViews
 from arview.measurement.types import Move
 
@@ -45,7 +45,8 @@ def measure_plane_by_edges(
     normal, point = np.array(datum.direction_in_model), np.array(datum.point_in_model)
     lies = np.abs((predicted.points - point) @ normal) < 0.05
     lies &= np.abs(predicted.tangents @ normal) < 0.02
-    edges, is_clear = predicted.of(lies), rival_px(predicted, views, o.rival_px)[lies] > o.rival_px
+    gaps_px = rival_offsets_px(predicted, views, o.rival_px)[lies]
+    edges, is_clear = predicted.of(lies), np.hypot(*gaps_px.T) > o.rival_px
     directions = plane_directions(normal)
     _check_seen(datum, edges, o)
     moves = []

@@ -65,8 +65,9 @@ class MeasuredComponent:
         return np.asarray(grid[np.argsort(np.linalg.norm(grid, axis=1), kind="stable")])
 
     def move(
-        self, method: Method, fit: RigidFit, by_poses: Array, place: Array, systematic_mm: float, support: float
-    ) -> Move:
+        self, method: Method, fit: RigidFit, by_poses: Array, place: Array, systematic_mm: float, support: float,
+        common: Array | None = None,
+    ) -> Move:  # fmt: skip
         """The measured move from the last fit.
 
         Args:
@@ -76,12 +77,15 @@ class MeasuredComponent:
             place: (4,4) where the component is.
             systematic_mm: standard deviation, in every direction, of errors that the residuals do not show.
             support: see `Move`.
+            common: (6,) standard deviation of the twist by an error that moves all measurements together.
         """
         scale = np.repeat([1.0 / self.radius_mm, 1.0], 3)
         project = np.eye(6) - fit.undetermined.T @ fit.undetermined
         # A shift of a face rotates the component by more than it would at the rim, since faces do not reach that far.
         systematic = np.diag(np.repeat([4.0, 1.0], 3)) * systematic_mm**2
         covariance = fit.covariance + project @ systematic @ project * np.outer(scale, scale)
+        if common is not None:
+            covariance = covariance + np.outer(common, common)
         if self.views.pose_covariance is not None:
             covariance = covariance + by_poses @ self.views.pose_covariance @ by_poses.T
         extra = len(fit.undetermined) - len(self.free)

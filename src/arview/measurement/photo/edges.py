@@ -22,7 +22,7 @@ from arview.measurement.photo.component import MeasuredComponent
 from arview.measurement.photo.fit import RigidFit, fit_rigid, move_rows
 from arview.measurement.photo.options import EdgeOptions
 from arview.measurement.photo.patches import near_others
-from arview.measurement.photo.rival_edges import EdgePoints, rival_px
+from arview.measurement.photo.rival_edges import EdgePoints, merged_shift_px, rival_offsets_px
 from arview.measurement.photo.views import PhotoViews
 from arview.measurement.types import Move, NotMeasured
 
@@ -41,6 +41,7 @@ class EdgeOffsets:
         seen: (N,) whether the point is inside the photo.
         hypotheses_mm, strengths: (N,K) positions and slopes of all steps found, 0 = none.
         pose_rows: (N,6) derivative of the offset by the twist of its photo's pose.
+        merged_mm: (N,) by how much the blurred step of another edge beside it may shift the step.
     """
 
     directions: Array
@@ -51,11 +52,12 @@ class EdgeOffsets:
     hypotheses_mm: Array
     strengths: Array
     pose_rows: Array
+    merged_mm: Array
 
 
 def edge_offsets(
     edges: EdgePoints, center: Array, views: PhotoViews, reach_px: float, options: EdgeOptions, level: int = 0,
-    shift_px: float = 0.0,
+    shift_px: float = 0.0, gaps_px: Array | None = None,
 ) -> EdgeOffsets:  # fmt: skip
     """Find a step of brightness across each predicted edge point.
 
@@ -67,8 +69,10 @@ def edge_offsets(
         options: see `EdgeOptions`.
         level: resolution of the photos: 0 is full size, each further level half of it.
         shift_px: search this far beside the edge; what is found there is due to chance.
+        gaps_px: (N,2) of `rival_offsets_px`, in px of full size; None: no edge has another one beside it.
     """
     n = len(edges.points)
+    gap = np.full(n, np.inf)
     directions, mm_per_px, twists = np.zeros((n, 3)), np.ones(n), np.zeros((n, 6))
     hypotheses, strengths, seen = np.zeros((n, 4)), np.zeros((n, 4)), np.zeros(n, dtype=bool)
     for view in np.unique(edges.view):
@@ -90,13 +94,17 @@ def edge_offsets(
         )
         size = np.linalg.norm(by_model, axis=1)
         mm_per_px[of], seen[of] = 1.0 / size, inside
+        if gaps_px is not None:
+            has_rival = np.isfinite(gaps_px[of]).all(axis=1)
+            gap[of[has_rival]] = np.sum(gaps_px[of[has_rival]] * normals[has_rival], axis=1)
         directions[of] = by_model / size[:, None]
         hypotheses[of], strengths[of] = offsets / size[:, None], slopes
         twists[of] = np.concatenate([np.cross(in_cam, by_cam), by_cam], axis=1) / size[:, None]
     chosen, slope = choose_steps(
         hypotheses / mm_per_px[:, None], strengths, 0.4 * reach_px, options.half_slope
     )  # in px, so that the choice does not depend on the distance
-    return EdgeOffsets(directions, chosen * mm_per_px, mm_per_px, slope, seen, hypotheses, strengths, twists)
+    merged_mm = merged_shift_px(gap, options.blur_px) * mm_per_px
+    return EdgeOffsets(directions, chosen * mm_per_px, mm_per_px, slope, seen, hypotheses, strengths, twists, merged_mm)
 
 
 def _across(camera: Camera, in_cam: Array, pixels: Array, tangents: Array) -> tuple[Array, Array]:
@@ -165,8 +173,9 @@ class ComponentEdges:
             # Between near edges the nearest step is the right one only once the place is known well; a step beyond the
             # middle between an edge and its rival is the rival's.
             is_fine = turn >= len(rounds) - o.fine_rounds
-            edges, rivals = self._clear_of(place, self._clear[is_fine])
-            found = edge_offsets(edges, apply(place, self.body.center), self.views, reach_px, o, level)
+            edges, gaps_px = self._clear_of(place, self._clear[is_fine])
+            rivals = np.hypot(*gaps_px.T)
+            found = edge_offsets(edges, apply(place, self.body.center), self.views, reach_px, o, level, gaps_px=gaps_px)
             ok = found.seen & (found.slopes != 0.0)
             if is_fine:
                 ok &= np.abs(found.offsets_mm) < 0.5 * rivals * found.mm_per_px
@@ -188,7 +197,9 @@ class ComponentEdges:
             return NotMeasured(self.body.shape.name, "edges", reason, support=support)
         by_poses = pose_gain(self.views, fit, edges.view[ok], found.pose_rows[ok])
         systematic_px = float(np.hypot(o.systematic_px, o.flanked_px * flanked))
-        return self.body.move("edges", fit, by_poses, place, systematic_px * self.body.px_mm, support)
+        # Edges of one kind have steps of one kind beside them, so that they are all shifted the same way.
+        merged = fit.gain @ found.merged_mm[ok]
+        return self.body.move("edges", fit, by_poses, place, systematic_px * self.body.px_mm, support, merged)
 
     def _choose_clear(self, place: Array) -> float:
         """Set the least distances of rivals in first and last rounds; return the share of points that are flanked.
@@ -221,19 +232,19 @@ class ComponentEdges:
         return self._clear_of(place, clear_px)[0]
 
     def _clear_of(self, place: Array, clear_px: float) -> tuple[EdgePoints, Array]:
-        """The points of `predicted`, and (N,) the distance to the nearest edge beside each, px; inf if far."""
-        edges, rivals = self._all_predicted(place)
-        kept = np.flatnonzero(rivals >= clear_px)
+        """The points of `predicted`, and (N,2) the offset of the nearest edge beside each, px; inf if far."""
+        edges, gaps_px = self._all_predicted(place)
+        kept = np.flatnonzero(np.hypot(*gaps_px.T) >= clear_px)
         count = self.options.edges.max_points
         kept = kept[:: int(np.ceil(len(kept) / count))] if len(kept) > count else kept
-        return edges.of(kept), rivals[kept]
+        return edges.of(kept), gaps_px[kept]
 
     def _all_predicted(self, place: Array) -> tuple[EdgePoints, Array]:
-        """All edge points at a place, and (N,) distance to the nearest edge beside each, px."""
+        """All edge points at a place, and (N,2) offset of the nearest edge beside each, px."""
         if self._predicted is not None and self.body.is_same(self._predicted[0], place):
-            before, edges, rivals = self._predicted
+            before, edges, gaps_px = self._predicted
             step = place @ invert(before)
-            return EdgePoints(apply(step, edges.points), edges.tangents @ step[:3, :3].T, edges.view), rivals
+            return EdgePoints(apply(step, edges.points), edges.tangents @ step[:3, :3].T, edges.view), gaps_px
         o = self.options.edges
         corners = apply(place, self.body.corners)
         points, tangents, views = [], [], []
@@ -253,15 +264,15 @@ class ComponentEdges:
             tangents.append(found.tangents_in_model[good])
             views.append(np.full(np.count_nonzero(good), view))
         if not points:
-            return EdgePoints(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, dtype=np.int64)), np.zeros(0)
+            return EdgePoints(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, dtype=np.int64)), np.zeros((0, 2))
         # Edges at joints are rivals too: the photos show them.
         nominal = np.concatenate(points)
         edges = EdgePoints(
             apply(place, nominal), np.concatenate(tangents) @ place[:3, :3].T, np.concatenate(views).astype(np.int64)
         )
-        rivals = rival_px(edges, self.views, o.rival_reach_px)
+        gaps_px = rival_offsets_px(edges, self.views, o.rival_reach_px)
         apart = ~near_others(nominal, self.views.model, self.body.index, self.options.joint_mm)
-        self._predicted = (place, edges.of(apart), rivals[apart])
+        self._predicted = (place, edges.of(apart), gaps_px[apart])
         return self._predicted[1:]
 
     def _capture(self, edges: EdgePoints, level: int) -> Array:

@@ -55,6 +55,7 @@ class EdgeOptions:
     rival_px: float = 2.0  # the same in the last rounds: blur merges nearer steps
     rival_reach_px: float = 6.0  # an edge farther than this is no rival: the last rounds search half as far
     fine_rounds: int = 3  # number of the last rounds
+    blur_px: float = 1.0  # standard deviation of a step's blur: lens, sensor, smoothing, and the samples of a profile
     flanked_px: float = 0.5  # systematic standard deviation where all edges have others beside them: half their gap
     systematic_px: float = 0.03  # standard deviation of a common shift of all edges of a component: chamfers, light
 

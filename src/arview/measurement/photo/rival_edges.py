@@ -1,4 +1,4 @@
-"""Predicted edge points, and how near another edge runs beside them: then a step may be that of either."""
+"""Predicted edge points, and how near another edge runs beside them: its step shifts theirs, or is taken for it."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ class EdgePoints:
         return EdgePoints(self.points[which], self.tangents[which], self.view[which])
 
 
-def rival_px(edges: EdgePoints, views: PhotoViews, reach_px: float, same_px: float = 0.3) -> Array:
-    """(N,) distance in the photo from each edge point to the nearest other edge that runs beside it; inf beyond reach.
+def rival_offsets_px(edges: EdgePoints, views: PhotoViews, reach_px: float, same_px: float = 0.3) -> Array:
+    """(N,2) offset in the photo, across each edge point's edge, of the nearest other edge beside it; inf beyond reach.
 
     Args:
         edges: all visible edge points of a component in the photos.
@@ -41,7 +41,7 @@ def rival_px(edges: EdgePoints, views: PhotoViews, reach_px: float, same_px: flo
     """
     from scipy.spatial import cKDTree
 
-    result = np.full(len(edges.points), np.inf)
+    result = np.full((len(edges.points), 2), np.inf)
     for view in np.unique(edges.view):
         of = np.flatnonzero(edges.view == view)
         camera, pose = views.cameras[view], views.cam_from_model[view]
@@ -68,10 +68,31 @@ def _note(
     result: Array, of: NDArray[np.int64], first: NDArray[np.int64], second: NDArray[np.int64], pixels: Array,
     along: Array, reach_px: float, same_px: float,
 ) -> None:  # fmt: skip
-    """Lower the distance of the first points of pairs where the second ones are on an edge beside theirs."""
+    """Take over the offsets of the first points of pairs where the second ones are on a nearer edge beside theirs."""
     apart = pixels[second] - pixels[first]
-    across = np.abs(along[first, 0] * apart[:, 1] - along[first, 1] * apart[:, 0])
+    normal = np.stack([-along[first, 1], along[first, 0]], axis=1)
+    signed = np.sum(normal * apart, axis=1)
+    across = np.abs(signed)
     onward = np.abs(np.sum(along[first] * apart, axis=1))
     parallel = np.abs(np.sum(along[first] * along[second], axis=1)) > 0.8
     beside = parallel & (onward < 2.5) & (across > same_px) & (across < reach_px)
-    np.minimum.at(result, of[first[beside]], across[beside])
+    beside &= across < np.hypot(*result[of[first]].T)
+    # The nearest is written last.
+    order = np.flatnonzero(beside)[np.argsort(-across[beside], kind="stable")]
+    result[of[first[order]]] = normal[order] * signed[order, None]
+
+
+def merged_shift_px(gap_px: Array, blur_px: float) -> Array:
+    """(N,) by how much a step of the same height beside a step may shift it, px; 0 where there is none.
+
+    Two blurred steps attract each other if both get brighter the same way, and repel each other if not, as the two
+    edges of a thin sheet do (Steger, "Unbiased extraction of curvilinear structures from 2D and 3D images", 1998, for
+    lines). To first order the steepest place moves by ``gap exp(-gap² / 2 blur²)`` for steps of the same height.
+
+    Args:
+        gap_px: (N,) signed distance from the step to the other one; inf where there is none.
+        blur_px: standard deviation of the blur of a step.
+    """
+    near = np.isfinite(gap_px)
+    gap = np.where(near, gap_px, 0.0)
+    return gap * np.exp(-0.5 * (gap / blur_px) ** 2)
