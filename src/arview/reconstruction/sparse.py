@@ -61,6 +61,7 @@ class SparseOptions:
     band_px: float = 2.0  # half width of the band around epipolar lines in the second pass
     min_matches: int = 15  # pairs with fewer matches are due to chance
     max_error_px: float = 2.0  # observations with larger errors are left out of the last adjustment
+    last_tolerance: float = 1e-5  # relative decrease of the cost at which the last adjustment ends
     min_centre_move: float = 0.001  # of the longer side; smaller moves of the principal point are not significant …
     max_centre_move: float = 0.05  # … and larger ones mean that the views do not determine it
     still: StillOptions = field(default_factory=StillOptions)
@@ -333,7 +334,7 @@ def triangulate_and_adjust(
         refines_centre = adjust_with_centre(model, options, threads)
     tell("adjusting", 2, 3)
     pycolmap.ObservationManager(model).filter_all_points3D(options.max_error_px, options.min_angle_deg)
-    adjuster = adjust(model, threads, refines_centre=refines_centre)
+    adjuster = adjust(model, threads, refines_centre=refines_centre, tolerance=options.last_tolerance)
     tell("adjusting", 3, 3)
     return model, adjuster
 
@@ -416,10 +417,11 @@ def _is_refined(camera: Any) -> bool:
     return bool(camera.model.name != CALIBRATED_MODEL)
 
 
-def adjust(model: Any, threads: int, refines_centre: bool, iterations: int = 25) -> Any:
+def adjust(model: Any, threads: int, refines_centre: bool, iterations: int = 25, tolerance: float = 1e-7) -> Any:
     """Bundle adjustment in place: poses, points, and the intrinsics of lenses that are not calibrated.
 
-    Returns the solved pycolmap adjuster, from which covariances can be computed.
+    It ends after ``iterations``, or when the cost decreases by less than the share ``tolerance`` in one. Returns the
+    solved pycolmap adjuster, from which covariances can be computed.
     """
     pycolmap = import_pycolmap()
     options = pycolmap.BundleAdjustmentOptions(print_summary=False, refine_principal_point=refines_centre)
@@ -427,7 +429,7 @@ def adjust(model: Any, threads: int, refines_centre: bool, iterations: int = 25)
     options.ceres.loss_function_scale = 0.5
     options.ceres.solver_options.num_threads = threads
     options.ceres.solver_options.max_num_iterations = iterations
-    options.ceres.solver_options.function_tolerance = 1e-7
+    options.ceres.solver_options.function_tolerance = tolerance
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in model.reg_image_ids():
         config.add_image(image_id)
