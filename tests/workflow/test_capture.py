@@ -133,7 +133,7 @@ def test_nothing_is_taken_while_the_part_is_lost(tmp_path: Path) -> None:
     assert len(taken) > 5
     for pose in taken:
         assert not any(np.allclose(walk.poses[index], pose) for index in lost)
-    assert summary.reasons[words.NOT_TRACKED] == len(lost)
+    assert summary.reasons[words.NOT_TRACKED.english] == len(lost)
     assert not (tmp_path / "out" / "job.json").exists()
 
 

@@ -225,7 +225,8 @@ def _check_finite(component: RawComponent, path: Path) -> None:
 
 def _bounding_size(raw: RawModel) -> Array:
     used = [component.vertices[np.unique(component.faces)] for component in raw.components if len(component.faces)]
-    return np.ptp(np.concatenate([np.stack([v.min(axis=0), v.max(axis=0)]) for v in used]), axis=0)
+    corners = np.concatenate([np.stack([v.min(axis=0), v.max(axis=0)]) for v in used])
+    return np.asarray(np.ptp(corners, axis=0), dtype=np.float64)
 
 
 def _size_text(size_mm: Array) -> str:
