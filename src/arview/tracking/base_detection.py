@@ -167,7 +167,7 @@ class BaseDetection:
             return True
         flat = (in_cam[:, :2] / in_cam[:, 2:]).astype(np.float32)
         width = min(cv2.minAreaRect(flat)[1]) * float(in_cam[:, 2].mean())
-        return width >= self.options.min_width * float(np.linalg.norm(np.ptp(base.bounds_in_model, axis=0)))
+        return bool(width >= self.options.min_width * np.linalg.norm(np.ptp(base.bounds_in_model, axis=0)))
 
     @property
     def detector(self) -> Detector:
