@@ -49,6 +49,7 @@ class PairRegistrationOptions:
     max_inside: float = 0.25  # share of the points near the CAD that may lie inside of it
     min_lead: float = 1.06  # score over that of the next best pose, below which the place is ambiguous
     scene: ScenePointOptions = field(default_factory=ScenePointOptions)  # preparation of the cloud
+    list_block: int = 2_000_000  # distances between points that are kept in memory at a time
     rounds: int = 4  # searches with other pairs, until the part is found
     seed: int = 0
 
@@ -278,13 +279,25 @@ def _near_lists(
     scene: ScenePoints, diameter_mm: float, o: PairRegistrationOptions, rng: np.random.Generator
 ) -> NDArray[np.int64]:
     """(N,J) for each scene point, points within 0.6 diameters in random order, rare ones preferred; -1 at the end."""
-    lists = np.full((len(scene.points), 4 * o.scored), -1, dtype=np.int64)
-    tree = cKDTree(scene.points)
-    for i, point in enumerate(scene.points):  # one at a time: the lists of all together would fill a gigabyte
-        near = np.array(tree.query_ball_point(point, 0.6 * diameter_mm))
-        # Weighted choice without repetition (Efraimidis & Spirakis 2006).
-        order = np.argsort(-(rng.random(len(near)) ** (1.0 / scene.weights[near])))[: lists.shape[1]]
-        lists[i, : len(order)] = rng.permutation(near[order])
+    count = len(scene.points)
+    lists = np.full((count, 4 * o.scored), -1, dtype=np.int64)
+    width = min(count, lists.shape[1])
+    points = (scene.points - scene.points.mean(axis=0)).astype(np.float32)
+    squares = np.sum(points**2, axis=1)
+    slowness = (1.0 / scene.weights).astype(np.float32)
+    # In blocks, since the table of all together would fill a gigabyte.
+    block = max(1, o.list_block // count)
+    for first in range(0, count, block):
+        part = slice(first, first + block)
+        square = squares[part, None] + squares[None] - 2.0 * points[part] @ points.T
+        # Weighted choice without repetition: the first arrivals (Efraimidis & Spirakis 2006).
+        arrival = rng.standard_exponential(square.shape, dtype=np.float32)
+        arrival *= slowness
+        arrival[square > (0.6 * diameter_mm) ** 2] = np.inf
+        chosen = np.argpartition(arrival, width - 1, axis=1)[:, :width]
+        is_near = np.isfinite(np.take_along_axis(arrival, chosen, axis=1))
+        order = np.argsort(np.where(is_near, rng.random(chosen.shape), 2.0), axis=1)
+        lists[part, :width] = np.take_along_axis(np.where(is_near, chosen, -1), order, axis=1)
     return lists
 
 
