@@ -54,7 +54,7 @@ class ToldJobs:
 
     def add(self, name: str, **more: Any) -> dict[str, Any]:
         """Add a job."""
-        job = {
+        job: dict[str, Any] = {
             "id": name, "part": "bracket_plate/part.toml", "part_name": "bracket_plate", "serial": "BP-1",
             "created": "2026-11-27T06:12:00Z", "parent": None, "photos": [], "attachments": [], "inspection": None,
             "rework": [], "decisions": [], "signed": None, "rechecks": [], "before_after": [], "components": None,
