@@ -193,6 +193,8 @@ def test_distances_that_cannot_work():
     assert "lies inside the part" in texts(check_part(part_of(plate, view_range=ViewRange((50, 900)))), "problem")
     far = check_part(part_of(plate, view_range=ViewRange((5000, 9000))))
     assert "the whole part is 40 px across; come nearer" in texts(far, "problem")
+    default = check_part(part_of(plate))
+    assert default.view_range.distance_mm[1] > 1000 and "come nearer" not in texts(default, "problem")
     close = check_part(part_of(plate, view_range=ViewRange((120, 500))))
     assert "pictures wide" in texts(close, "warning")
 
@@ -207,7 +209,7 @@ def test_sheets_open_and_non_manifold_meshes():
     said = texts(check, "warning")
     assert "sheet is a sheet without thickness (0 mm)" in said
     assert "2 components are not closed, 2 to 4 open edges each, which will appear as contours: tray, finned" in said
-    assert "finned has 1 edges shared by more than two triangles" in said
+    assert "finned has 1 edge shared by more than two triangles" in said
     assert check.components[1].fitness.volume_mm3 is None
 
 

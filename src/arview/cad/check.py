@@ -265,7 +265,7 @@ def _view_findings(part: Part, camera: Camera, view_range: ViewRange) -> list[Pa
         text = f"the nearest distance is {near_mm:.2g} mm: detection and tracking need {MIN_TRACKED_MM:g} mm and more"
         findings.append(PartFinding("problem", text))
     across_px = camera.fx * diameter_mm / far_mm
-    if across_px < 60.0:
+    if part.view_range and across_px < 60.0:  # the default range ends there
         findings.append(
             PartFinding("problem", f"at {far_mm:.0f} mm the whole part is {across_px:.0f} px across; come nearer")
         )

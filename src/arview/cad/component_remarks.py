@@ -107,12 +107,14 @@ def mesh_remarks(name: str, fitness: MeshFitness) -> list[Remark]:
         plural = "are sheets without thickness, give them one in the CAD"
         remarks.append(Remark("warning", name, text, plural))
     elif fitness.open_edge_count:
-        text = f"is not closed: {fitness.open_edge_count} open edges; they will appear as contours"
+        count = fitness.open_edge_count
+        edges = "1 open edge, which" if count == 1 else f"{count} open edges, which"
+        text = f"is not closed: {edges} will appear as {'a contour' if count == 1 else 'contours'}"
         plural = "are not closed, {low} to {high} open edges each, which will appear as contours"
         remarks.append(Remark("warning", name, text, plural, float(fitness.open_edge_count)))
     if fitness.non_manifold_edge_count:
         count = fitness.non_manifold_edge_count
-        text = f"has {count} edges shared by more than two triangles (non-manifold)"
+        text = f"has {count} edge{'' if count == 1 else 's'} shared by more than two triangles (non-manifold)"
         plural = "have edges shared by more than two triangles (non-manifold), {low} to {high} each"
         remarks.append(Remark("warning", name, text, plural, float(count)))
     if not fitness.is_consistent:
