@@ -198,7 +198,7 @@ class ComponentEdges:
         by_poses = pose_gain(self.views, fit, edges.view[ok], found.pose_rows[ok])
         systematic_px = float(np.hypot(o.systematic_px, o.flanked_px * flanked))
         # Edges of one kind have steps of one kind beside them, so that they are all shifted the same way.
-        merged = fit.gain @ found.merged_mm[ok]
+        merged = _RIVAL_HEIGHT_STD * fit.gain @ found.merged_mm[ok]
         return self.body.move("edges", fit, by_poses, place, systematic_px * self.body.px_mm, support, merged)
 
     def _choose_clear(self, place: Array) -> float:
@@ -331,6 +331,8 @@ class ComponentEdges:
 
 CREASE_DEG = 35.0
 """Faces that meet at a larger angle form an edge; smaller angles are facets of a curved surface."""
+_RIVAL_HEIGHT_STD = float(1.0 / np.sqrt(3.0))
+"""Standard deviation of the height of a step beside another one, in heights of that one: anything from -1 to 1."""
 _FEW_PAIRS = 700
 """Points used to estimate the correlation of errors while the place is still being refined."""
 _SIGMA_PX = 0.3
