@@ -2,21 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
 import pytest
 
-from arview.capture.information import (
-    InformationOptions,
-    KnownViews,
-    Views,
-    choose_views,
-    expanded_uncertainty,
-    expected_error,
-    gains,
-)
+from arview.capture.information import KnownViews, Views, choose_views, expanded_uncertainty, expected_error, gains
 from arview.geometry import Array
 
 FOCAL_PX = 1500.0
@@ -32,13 +23,13 @@ def eyes_at(azimuths_deg: list[float], elevation_deg: float = 35.0, distance_mm:
     )
 
 
-def views_of(eyes: Array, options: InformationOptions | None = None, points: Array | None = None) -> Views:
+def views_of(eyes: Array, points: Array | None = None) -> Views:
     points = np.zeros((1, 3)) if points is None else points
-    return Views.of(points, np.ones((len(eyes), len(points)), dtype=bool), eyes, FOCAL_PX, options)
+    return Views.of(points, np.ones((len(eyes), len(points)), dtype=bool), eyes, FOCAL_PX)
 
 
-def information(views: Views, options: InformationOptions | None = None) -> Array:
-    return KnownViews(views, options).information()
+def information(views: Views) -> Array:
+    return KnownViews(views).information()
 
 
 def triangulated(eyes: Array, rays: Array) -> Array:
@@ -52,7 +43,7 @@ def triangulated(eyes: Array, rays: Array) -> Array:
 def test_predicted_uncertainty_is_that_of_triangulated_bearings(azimuths_deg: list[float]) -> None:
     eyes = eyes_at(azimuths_deg)
     rng = np.random.default_rng(3)
-    predicted = information(views_of(eyes, BEARINGS), BEARINGS)
+    predicted = information(views_of(eyes))
     found = []
     for _ in range(4000):
         rays = -eyes / np.linalg.norm(eyes, axis=1, keepdims=True)
@@ -60,14 +51,13 @@ def test_predicted_uncertainty_is_that_of_triangulated_bearings(azimuths_deg: li
         found.append(triangulated(eyes, rays / np.linalg.norm(rays, axis=1, keepdims=True)))
     covariance = np.cov(np.array(found).T)
     worst = 2.0 * np.sqrt(np.linalg.eigvalsh(covariance)[-1])
-    assert expanded_uncertainty(predicted, BEARINGS)[0] == pytest.approx(worst, rel=0.05)
-    assert expected_error(predicted, BEARINGS)[0] == pytest.approx(2.0 * np.sqrt(np.trace(covariance)), rel=0.05)
+    assert expanded_uncertainty(predicted)[0] == pytest.approx(worst, rel=0.05)
+    assert expected_error(predicted)[0] == pytest.approx(2.0 * np.sqrt(np.trace(covariance)), rel=0.05)
 
 
 def test_a_component_that_is_not_seen_keeps_its_prior() -> None:
     seen = np.array([[True, False]])
     views = Views.of(np.zeros((2, 3)), seen, np.array([[0, 0, 500.0]]), FOCAL_PX)
-    options = InformationOptions()
     known = information(views)
     # One photo does not tell the depth: along the ray, both keep the prior.
     assert expanded_uncertainty(known) == pytest.approx(2 * np.hypot(options.prior_mm, options.common_mm) * np.ones(2))
@@ -75,17 +65,16 @@ def test_a_component_that_is_not_seen_keeps_its_prior() -> None:
 
 
 def test_more_photos_do_not_lower_what_is_common_to_all() -> None:
-    options = replace(InformationOptions(), bearing_px=1e-6)
-    u_mm = expanded_uncertainty(information(views_of(eyes_at([0, 20, 40, 60, 80]), options), options))
+    u_mm = expanded_uncertainty(information(views_of(eyes_at([0, 20, 40, 60, 80]))))
     assert u_mm[0] == pytest.approx(2 * options.common_mm, rel=1e-3)
 
 
 def test_three_photos_that_can_be_matched_tell_more_than_three_far_apart() -> None:
     near, far = (information(views_of(eyes_at(angles))) for angles in ([0, 25, 50], [0, 120, 240]))
-    bearings = [information(views_of(eyes_at(angles), BEARINGS), BEARINGS) for angles in ([0, 25, 50], [0, 120, 240])]
+    bearings = [information(views_of(eyes_at(angles))) for angles in ([0, 25, 50], [0, 120, 240])]
     assert expected_error(near)[0] < expected_error(far)[0]
     # By bearings alone it would be the other way.
-    assert expected_error(bearings[0], BEARINGS)[0] > expected_error(bearings[1], BEARINGS)[0]
+    assert expected_error(bearings[0])[0] > expected_error(bearings[1])[0]
 
 
 def random_views(rng: np.random.Generator, count: int) -> tuple[Views, Array]:
@@ -99,19 +88,19 @@ def random_views(rng: np.random.Generator, count: int) -> tuple[Views, Array]:
 
 @pytest.mark.parametrize("options", [InformationOptions(), BEARINGS])
 @pytest.mark.parametrize("seed", range(5))
-def test_the_chosen_view_lowers_the_error_most(seed: int, options: InformationOptions) -> None:
+def test_the_chosen_view_lowers_the_error_most(seed: int) -> None:
     views, directions = random_views(np.random.default_rng(seed), 11)
     weights = np.array([1.0, 4.0])
     taken, rest = views[:2], views[2:]
-    order = choose_views(taken, rest, weights, directions[2:], list(directions[:2]), 4, 180.0, options)
+    order = choose_views(taken, rest, weights, directions[2:], list(directions[:2]), 4, 180.0)
     assert len(set(order)) == 4
 
     def error(chosen: tuple[int, ...]) -> float:
         some = views[[0, 1, *(index + 2 for index in chosen)]]
-        return float(expected_error(information(some, options), options) @ weights)
+        return float(expected_error(information(some)) @ weights)
 
     assert error((order[0],)) == pytest.approx(min(error((index,)) for index in range(len(rest))))
-    gain = gains(KnownViews(taken, options), rest, weights, options)[order[0]]
+    gain = gains(KnownViews(taken), rest, weights)[order[0]]
     assert gain == pytest.approx(error(()) - error((order[0],)))
     if options is BEARINGS:  # the choice of three is near the best of all choices
         best = min(error(some) for some in combinations(range(len(rest)), 3))
@@ -121,8 +110,8 @@ def test_the_chosen_view_lowers_the_error_most(seed: int, options: InformationOp
 def test_views_too_far_from_every_photo_wait() -> None:
     eyes = eyes_at([0, 30, 60, 90, 120, 150, 180])
     directions = eyes / np.linalg.norm(eyes, axis=1, keepdims=True)
-    views = views_of(eyes, BEARINGS)
-    near = choose_views(views[:1], views[1:], np.ones(1), directions[1:], [directions[0]], 4, 26.0, BEARINGS)
+    views = views_of(eyes)
+    near = choose_views(views[:1], views[1:], np.ones(1), directions[1:], [directions[0]], 4, 26.0)
     assert near == [0, 1, 2, 3]
-    far = choose_views(views[:1], views[1:], np.ones(1), directions[1:], [directions[0]], 4, 180.0, BEARINGS)
+    far = choose_views(views[:1], views[1:], np.ones(1), directions[1:], [directions[0]], 4, 180.0)
     assert far[0] >= 2

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from arview.geometry import Array
-from arview.live.options import ConnectionLimits, LiveOptions, RequestLimits, WebrtcOptions
+from arview.live.options import LiveOptions, RequestLimits
 from arview.live.server.loading import load_subjects
 from arview.live.stream.subjects import Subjects
 from arview.video import Image, open_source

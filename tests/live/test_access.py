@@ -16,7 +16,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from arview.live.options import ConnectionLimits, RequestLimits
+from arview.live.options import RequestLimits
 from arview.live.security import limits
 from arview.live.security.access import Access
 from arview.live.security.addresses import LOOPBACK

@@ -14,7 +14,6 @@ from pathlib import Path
 
 import pytest
 
-from arview.live.options import ConnectionLimits
 from arview.live.security.addresses import LOOPBACK
 from arview.live.security.connections import ConnectionTable
 from arview.live.security.refusals import Refusal
@@ -59,7 +58,7 @@ def test_new_connections_of_one_address_are_rated_and_guests_are_counted() -> No
 
 
 @contextmanager
-def https_server(folder: Path, monkeypatch: pytest.MonkeyPatch, limits: ConnectionLimits) -> Iterator[LiveServer]:
+def https_server(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[LiveServer]:
     monkeypatch.setenv("ARVIEW_DATA", str(folder))
     chosen = options(max_age_s=None, connections=limits)
     server = LiveServer(chosen, open_endpoint(LOOPBACK, 0))
@@ -99,7 +98,7 @@ def paired(line: http.client.HTTPSConnection, server: LiveServer) -> str:
 def test_idle_connections_of_one_address_stop_nobody(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, with_handshake: bool
 ) -> None:
-    with https_server(tmp_path, monkeypatch, ConnectionLimits()) as server:
+    with https_server(tmp_path, monkeypatch) as server:
         trusting = ssl.create_default_context(cadata=server.endpoint.certificates.authority_der)  # type: ignore[union-attr]
         port = server.endpoint.port
         before = http.client.HTTPSConnection(LOOPBACK, port, timeout=20, context=trusting)
@@ -131,7 +130,7 @@ def test_idle_connections_of_one_address_stop_nobody(
 @pytest.mark.slow
 def test_handshakes_that_do_not_end_are_cut(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with (
-        https_server(tmp_path, monkeypatch, ConnectionLimits()) as server,
+        https_server(tmp_path, monkeypatch) as server,
         socket.create_connection((LOOPBACK, server.endpoint.port), timeout=20) as line,
     ):
         began_s = time.monotonic()

@@ -15,7 +15,7 @@ from click.testing import CliRunner
 
 from arview.cli import main
 from arview.live.security.addresses import LOOPBACK
-from arview.live.security.devices import DeviceOptions, Devices, device_name, read_devices
+from arview.live.security.devices import Devices, device_name, read_devices
 from helpers.live_client import Http, Running, running, wait
 from helpers.live_sample import loader, options
 

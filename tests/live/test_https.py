@@ -23,16 +23,11 @@ from cryptography.x509.verification import PolicyBuilder, Store, VerificationErr
 from arview.errors import InputError, OutputError
 from arview.live.security import addresses
 from arview.live.security.addresses import LOOPBACK, Interface, bind, choose_host
-from arview.live.security.certificates import (
-    CertificateOptions,
-    local_certificates,
-    own_certificates,
-)
+from arview.live.security.certificates import local_certificates, own_certificates
 from arview.live.security.trust_page import apple_profile, fingerprint
 from arview.live.server.live_server import LiveServer, open_endpoint
 from helpers.live_sample import loader, options
 
-LIFETIMES = CertificateOptions()
 NOW = datetime(2026, 11, 22, 12, 0, tzinfo=UTC)
 HERE = ["192.168.7.20", LOOPBACK, "localhost"]
 

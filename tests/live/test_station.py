@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from arview.errors import InputError
-from arview.live.options import LiveOptions, StationOptions
+from arview.live.options import LiveOptions
 from arview.live.security.addresses import LOOPBACK
 from arview.live.stream import station
 from arview.live.stream.frames import from_jpeg

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 from arview.camera.read import guess_camera
-from arview.live.options import FeedOptions, RecordingOptions, StationOptions
+from arview.live.options import RecordingOptions
 from arview.live.server.workers import StuckError, WorkerPool
 from arview.live.stream import station as station_module
 from arview.live.stream.annotator import FrameAnnotator

@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 from aiortc.rtp import RtpPacket
 
-from arview.live.options import WebrtcOptions
 from arview.live.stream.stamp import strip_px
 from arview.live.transport.receiving import (
     MAX_WAITING_FRAMES,

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.assembly.log_odds import LogOddsOptions, evidence_features
+from arview.assembly.log_odds import evidence_features
 from arview.assembly.observation import ComponentObserver, Known, base_of
 from arview.cad.model import Model, make_model
 from arview.core.atomic import replacing
@@ -134,7 +134,7 @@ def _picture_odds(
         np.zeros(count, dtype=bool),
     )
     evidence, _ = observer.measure(image, perturbed_pose(pose, rng), known)
-    features = evidence_features(evidence, LogOddsOptions())
+    features = evidence_features(evidence)
     for c in np.flatnonzero(evidence.support.supported >= 0.0):
         place = ids == c
         if c == base or not place.any():

@@ -19,20 +19,26 @@ class Grade(StrEnum):
     NOT_ENOUGH = "not enough"
 
 
-@dataclass(frozen=True)
-class VerdictOptions:
-    """Limits of the grades; lengths in px as shares of the picture's diagonal."""
-
-    good_focal: float = 0.002  # relative U of the focal length: 0.2 % of the distance, 1 mm at arm's length
-    usable_focal: float = 0.01  # a guess from EXIF data is as good as more than this
-    good_pixel: float = 5e-4  # U of where a ray is seen, at the worst of 63 places: 1 px at 1080p
-    usable_pixel: float = 3e-3  # limit of usable for the same
-    usable_rms: float = 1e-3  # residuals; above, the board is not flat, or is another one
-    good_coverage: float = 0.7  # share of the picture's cells with a corner of the board
-    usable_coverage: float = 0.4  # limit of usable for the same
-    tilted_deg: float = 20.0  # views tilted by more than this determine the focal length
-    min_tilted: int = 4  # number of such views, to at least two sides
-    good_range: float = 1.3  # distance of the farthest over the nearest board
+GOOD_FOCAL = 0.002
+"""Relative U of the focal length: 0.2 % of the distance, 1 mm at arm's length."""
+USABLE_FOCAL = 0.01
+"""A guess from EXIF data is as good as more than this."""
+GOOD_PIXEL = 5e-4
+"""U of where a ray is seen, at the worst of 63 places: 1 px at 1080p."""
+USABLE_PIXEL = 3e-3
+"""Limit of usable for the same."""
+USABLE_RMS = 1e-3
+"""Residuals; above, the board is not flat, or is another one."""
+GOOD_COVERAGE = 0.7
+"""Share of the picture's cells with a corner of the board."""
+USABLE_COVERAGE = 0.4
+"""Limit of usable for the same."""
+TILTED_DEG = 20.0
+"""Views tilted by more than this determine the focal length."""
+MIN_TILTED = 4
+"""Number of such views, to at least two sides."""
+GOOD_RANGE = 1.3
+"""Distance of the farthest over the nearest board."""
 
 
 @dataclass(frozen=True)
@@ -72,9 +78,8 @@ class CalibrationVerdict:
         return replace(self, grade=grade, reasons=reasons, advice=(advice, *self.advice))
 
 
-def assess(solution: Solution, options: VerdictOptions | None = None) -> CalibrationVerdict:
+def assess(solution: Solution) -> CalibrationVerdict:
     """Compare a calibration with the limits, and say what to do if it is not good."""
-    options = options or VerdictOptions()
     camera = solution.camera
     diagonal = float(np.hypot(camera.width, camera.height))
     std = dict(zip(solution.parameters, solution.std, strict=True))
@@ -83,15 +88,15 @@ def assess(solution: Solution, options: VerdictOptions | None = None) -> Calibra
     pixel_u = pixel_uncertainty(solution, picture_grid(camera.width, camera.height))
     cells = _cells(solution)
     coverage = float(np.mean(cells[~np.isnan(cells)] > 0))
-    tilts, sides, distances = _attitudes(solution, options.tilted_deg)
+    tilts, sides, distances = _attitudes(solution, TILTED_DEG)
     ratio = float(distances.max() / distances.min())
     worst = float(np.nanmax(pixel_u))
 
     grades = [
-        _grade(focal_u, options.good_focal, options.usable_focal),
-        _grade(worst / diagonal, options.good_pixel, options.usable_pixel),
-        _grade(solution.rms_px / diagonal, 0.5 * options.usable_rms, options.usable_rms),
-        _grade(-coverage, -options.good_coverage, -options.usable_coverage),
+        _grade(focal_u, GOOD_FOCAL, USABLE_FOCAL),
+        _grade(worst / diagonal, GOOD_PIXEL, USABLE_PIXEL),
+        _grade(solution.rms_px / diagonal, 0.5 * USABLE_RMS, USABLE_RMS),
+        _grade(-coverage, -GOOD_COVERAGE, -USABLE_COVERAGE),
     ]
     reasons = [
         f"the focal length is known to ± {100 * focal_u:.2f} % only" if np.isfinite(focal_u)
@@ -106,15 +111,15 @@ def assess(solution: Solution, options: VerdictOptions | None = None) -> Calibra
     grade = max(grades, key=order.index)
     advice: list[str] = []
     if grade is not Grade.GOOD:
-        tilted = int(np.sum(tilts >= options.tilted_deg))
+        tilted = int(np.sum(tilts >= TILTED_DEG))
         focal_is_poor = grades[0] is not Grade.GOOD
-        if focal_is_poor and (tilted < options.min_tilted or sides < 2):
+        if focal_is_poor and (tilted < MIN_TILTED or sides < 2):
             advice.append("tilt the board more, by 30° to 45°, to the left, the right, upwards and downwards")
         if grades[3] is not Grade.GOOD or (grades[1] is not Grade.GOOD and not focal_is_poor):
             missing = _empty_corners(cells)
             where = f": none was seen in the {', '.join(missing)}" if missing else ""
             advice.append(f"bring the board to the corners and edges of the picture{where}")
-        if focal_is_poor and ratio < options.good_range:
+        if focal_is_poor and ratio < GOOD_RANGE:
             advice.append("take it from nearer and from farther: once filling the picture, once half of it")
         if len(solution.views) < 15:
             advice.append(f"take more views: {len(solution.views)} were used, 20 to 40 are good")

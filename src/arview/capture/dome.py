@@ -17,6 +17,15 @@ from arview.core.checks import check_type
 from arview.geometry import Array, look_at
 from arview.reconstruction.coverage import components_seen
 
+CELLS_PER_PHOTO = 1.8
+"""Directions of the dome per wanted photo."""
+CELL_DEG = (8.0, 24.0)
+"""Smallest and largest distance of neighbouring directions."""
+ELEVATION_DEG = (15.0, 75.0)
+"""Asked for where the part's range of views goes further."""
+FILL = (1.06, 0.55)
+"""Part's diameter over the picture's shorter side: nearest, farthest."""
+
 FITTING_FILL = 0.9
 """Share of the picture's shorter side that the part's diameter spans at the distance of a plan of photos."""
 
@@ -61,15 +70,13 @@ class CaptureDome:
         view_range = part.effective_view_range.for_camera(camera, model.diameter_mm)
         angles, cell_deg = _cells(view_range, options)
         directions = np.array([view_range.direction(azimuth, elevation) for azimuth, elevation in angles])
-        distance_mm = _ring(view_range, camera, model.diameter_mm, options)
+        distance_mm = _ring(view_range, camera, model.diameter_mm)
         middle_mm = float(np.sqrt(distance_mm[0] * distance_mm[1]))
         eyes = model.center_in_model + middle_mm * directions
         up = view_range.up_in_model
-        seen = np.array(
-            [components_seen(model, camera, look_at(eye, model.center_in_model, up), options.coverage) for eye in eyes]
-        )
+        seen = np.array([components_seen(model, camera, look_at(eye, model.center_in_model, up)) for eye in eyes])
         focal = focal_px(camera) * options.photo_px_per_px
-        views = Views.of(component_points(part), seen, eyes, focal, options.information)
+        views = Views.of(component_points(part), seen, eyes, focal)
         return cls(angles, directions, cell_deg, distance_mm, views)
 
     @property
@@ -112,12 +119,12 @@ def asked_elevation_deg(view_range: ViewRange, limits_deg: tuple[float, float]) 
 
 def _cells(view_range: ViewRange, options: CaptureOptions) -> tuple[Array, float]:
     """(N,2) azimuth and elevation of the cells, and their distance, so that there are enough for the photos wanted."""
-    low, high = asked_elevation_deg(view_range, options.elevation_deg)
+    low, high = asked_elevation_deg(view_range, ELEVATION_DEG)
     start, end = view_range.azimuth_deg
     is_round = end - start >= 360.0
     width_deg = min(end - start, 360.0)
     area = width_deg * np.rad2deg(np.sin(np.deg2rad(high)) - np.sin(np.deg2rad(low)))
-    cell_deg = float(np.clip(np.sqrt(area / (options.cells_per_photo * options.wanted_photos)), *options.cell_deg))
+    cell_deg = float(np.clip(np.sqrt(area / (CELLS_PER_PHOTO * options.wanted_photos)), *CELL_DEG))
     rings = max(1, round((high - low) / cell_deg))
     cells = []
     for ring in range(rings):
@@ -129,10 +136,10 @@ def _cells(view_range: ViewRange, options: CaptureOptions) -> tuple[Array, float
     return np.array(cells), cell_deg
 
 
-def _ring(view_range: ViewRange, camera: Camera, diameter_mm: float, options: CaptureOptions) -> tuple[float, float]:
+def _ring(view_range: ViewRange, camera: Camera, diameter_mm: float) -> tuple[float, float]:
     """Nearest and farthest distance of a photo: the part large in the picture, within the range of views."""
     low, high = view_range.distance_mm
-    near, far = (fitting_distance_mm(camera, diameter_mm, fill) for fill in options.fill)
+    near, far = (fitting_distance_mm(camera, diameter_mm, fill) for fill in FILL)
     near, far = float(np.clip(near, low, high)), float(np.clip(far, low, high))
     if far < 1.1 * near:  # the declared range is nearer or farther than the picture would want it
         near, far = max(low, 0.75 * far), min(high, 1.33 * near)

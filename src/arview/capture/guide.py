@@ -22,6 +22,23 @@ from arview.geometry import Array, apply, check_rigid
 from arview.pose import Pose, TrackingState
 from arview.reconstruction.coverage import unit
 
+QUALITY = (0.5, 0.4)
+"""Of the tracked pose; wrong ones mostly do not reach 0.5."""
+FOCUS_PX = 320
+"""Side of the part of the picture in which sharpness is measured."""
+MIN_INSIDE = 0.8
+"""Share of the part's bounding box that must be in the picture."""
+PENDING_S = 8.0
+"""After which a photo that was asked for and not reported counts as failed."""
+DISTANCE_SLACK = 0.06
+"""Hysteresis of the distance."""
+GAIN_SHARE = 0.5
+"""Of the best direction's gain from which a photo is taken from another one …."""
+MIN_GAIN_SHARE = 0.1
+"""… and the share accepted at the end of ``PATIENCE_S`` after the last photo."""
+PATIENCE_S = 6.0
+"""A person who does not go where it is best still gets photos."""
+
 
 class CaptureGuide:
     """Guided capture of one part for one job. It has no threads and is used by one at a time.
@@ -63,7 +80,7 @@ class CaptureGuide:
             self.needs.add(check_rigid(pose, "CaptureGuide: taken"))
         self._motion = MotionMonitor(self._corners, self._camera, o.trigger)
         self._focus = FocusMonitor(o.trigger)
-        self._quality = Hysteresis(*o.trigger.quality)
+        self._quality = Hysteresis(*QUALITY)
         self._distance: RingDistance = "far"
         self._take_id = 0
         self._asked: tuple[float, Array] | None = None  # time and pose of the photo that was asked for
@@ -85,7 +102,7 @@ class CaptureGuide:
             time_s: time stamp of the frame.
             gyro_rad_s: rate of turn by the device's gyroscope, None without one.
         """
-        if self._asked is not None and not 0.0 <= time_s - self._asked[0] <= self.options.trigger.pending_s:
+        if self._asked is not None and not 0.0 <= time_s - self._asked[0] <= PENDING_S:
             self.photo_failed()
         obstacle = self._obstacle(pose, image_rgb, time_s, gyro_rad_s)
         if obstacle is None and pose.cam_from_model is not None:
@@ -140,7 +157,7 @@ class CaptureGuide:
         is_still = self._motion.update(here, time_s, gyro_rad_s)
         self._distance = self._ring_distance(here)
         pixels = self._camera.project(apply(here, self._corners))
-        gray = None if image_rgb is None else middle_of_part(image_rgb, pixels, trigger.focus_px)
+        gray = None if image_rgb is None else middle_of_part(image_rgb, pixels, FOCUS_PX)
         is_sharp = gray is None or self._focus.update(gray, time_s)
         if self._asked is not None:
             return words.TAKING()
@@ -154,7 +171,7 @@ class CaptureGuide:
             return words.AMBIGUOUS()
         if self._distance != "good":
             return words.CLOSER() if self._distance == "far" else words.FARTHER()
-        if self._inside_share(pixels) < trigger.min_inside:
+        if self._inside_share(pixels) < MIN_INSIDE:
             return words.NOT_INSIDE()
         if self.needs.nearest_deg(self._direction(here)) < self.needs.apart_deg:
             return words.ALREADY_TAKEN()
@@ -173,16 +190,15 @@ class CaptureGuide:
 
         The share that is asked for falls with the time since the last photo.
         """
-        o = self.options
-        waited_s = o.patience_s if self._last_s is None else max(0.0, time_s - self._last_s)
-        share = o.gain_share + (o.min_gain_share - o.gain_share) * min(1.0, waited_s / o.patience_s)
+        waited_s = PATIENCE_S if self._last_s is None else max(0.0, time_s - self._last_s)
+        share = GAIN_SHARE + (MIN_GAIN_SHARE - GAIN_SHARE) * min(1.0, waited_s / PATIENCE_S)
         return self.needs.gain_of(cam_from_model, self._cell(cam_from_model)) >= share * self.needs.best_gain
 
     def _ring_distance(self, cam_from_model: Array) -> RingDistance:
         """Where the camera is beside the ring of good distances, with hysteresis."""
         distance_mm = float(np.linalg.norm(apply(cam_from_model, self._center)))
         near, far = self.dome.distance_mm
-        slack = 1.0 + self.options.distance_slack if self._distance == "good" else 1.0
+        slack = 1.0 + DISTANCE_SLACK if self._distance == "good" else 1.0
         if distance_mm < near / slack:
             return "near"
         return "far" if distance_mm > far * slack else "good"

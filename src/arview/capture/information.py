@@ -27,17 +27,20 @@ _NO_COSINE = -2.0
 """Stands for the cosine to a photo that is not there."""
 
 
-@dataclass(frozen=True)
-class InformationOptions:
-    """Errors of one photo and of all photos together."""
-
-    bearing_px: float = 0.12  # standard deviation of a component's direction in one photo: edges, patches and pose
-    common_mm: float = 0.02  # standard deviation that more photos do not lower: datums, methods that differ, form
-    prior_mm: float = 5.0  # standard deviation of a place before any photo
-    coverage_factor: float = 2.0  # k of the expanded uncertainty
-    matched_deg: float = 30.0  # angle to the second nearest photo up to which a photo counts in full …
-    match_fall_deg: float = 25.0  # … and by how much more its weight falls to a third
-    alone_weight: float = 0.1  # of a photo that no two others can be matched with: its edges still count
+BEARING_PX = 0.12
+"""Standard deviation of a component's direction in one photo: edges, patches and pose."""
+COMMON_MM = 0.02
+"""Standard deviation that more photos do not lower: datums, methods that differ, form."""
+PRIOR_MM = 5.0
+"""Standard deviation of a place before any photo."""
+COVERAGE_FACTOR = 2.0
+"""K of the expanded uncertainty."""
+MATCHED_DEG = 30.0
+"""Angle to the second nearest photo up to which a photo counts in full …."""
+MATCH_FALL_DEG = 25.0
+"""… and by how much more its weight falls to a third."""
+ALONE_WEIGHT = 0.1
+"""Of a photo that no two others can be matched with: its edges still count."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +67,6 @@ class Views:
     @staticmethod
     def of(
         points: Array, is_seen: NDArray[np.bool_], centers: Array, focal_px: float,
-        options: InformationOptions | None = None,
     ) -> Views:  # fmt: skip
         """The views of cameras at some places.
 
@@ -73,14 +75,12 @@ class Views:
             is_seen: (V,C) which of them each photo shows.
             centers: (V,3) of the cameras, mm.
             focal_px: their focal length.
-            options: see `InformationOptions`.
         """
-        options = options or InformationOptions()
         away = np.reshape(centers, (-1, 1, 3)) - points
         square = np.maximum(np.sum(away**2, axis=2), 1e-9)
         rays = away / np.sqrt(square)[..., None]
         across = np.eye(3) - rays[..., :, None] * rays[..., None, :]
-        weight = is_seen * (focal_px / options.bearing_px) ** 2 / square
+        weight = is_seen * (focal_px / BEARING_PX) ** 2 / square
         return Views(across * weight[..., None, None], rays, np.asarray(is_seen, dtype=bool))
 
 
@@ -91,9 +91,8 @@ class KnownViews:
         views: the photos.
     """
 
-    def __init__(self, views: Views, options: InformationOptions | None = None) -> None:
+    def __init__(self, views: Views) -> None:
         """Begin with some photos; there may be none of them."""
-        self._options = options or InformationOptions()
         self.views = views[:0]
         count = views.is_seen.shape[1]
         # Cosines to the nearest and second nearest other photo that shows the component.
@@ -141,47 +140,42 @@ class KnownViews:
 
     def _weights(self, cosines: Array) -> Array:
         """Weights of photos by the cosines to their second nearest one."""
-        o = self._options
         angle_deg = np.rad2deg(np.arccos(np.clip(cosines, -1.0, 1.0)))
-        beyond = np.maximum(angle_deg - o.matched_deg, 0.0) / o.match_fall_deg
+        beyond = np.maximum(angle_deg - MATCHED_DEG, 0.0) / MATCH_FALL_DEG
         near = np.where(cosines > _NO_COSINE, np.exp(-(beyond**2)), 0.0)
-        return o.alone_weight + (1.0 - o.alone_weight) * near
+        return ALONE_WEIGHT + (1.0 - ALONE_WEIGHT) * near
 
     def _prior(self) -> Array:
-        return prior_information(self.views.is_seen.shape[1], self._options)
+        return prior_information(self.views.is_seen.shape[1])
 
 
-def prior_information(count: int, options: InformationOptions | None = None) -> Array:
+def prior_information(count: int) -> Array:
     """(C,3,3) information on the places of components before any photo."""
-    options = options or InformationOptions()
-    return np.tile(np.eye(3) / options.prior_mm**2, (count, 1, 1))
+    return np.tile(np.eye(3) / PRIOR_MM**2, (count, 1, 1))
 
 
-def expanded_uncertainty(information: Array, options: InformationOptions | None = None) -> Array:
+def expanded_uncertainty(information: Array) -> Array:
     """(...,) expanded uncertainty along the worst axis, mm, of information (...,3,3)."""
-    options = options or InformationOptions()
     worst = np.maximum(np.linalg.eigvalsh(information)[..., 0], 1e-12)
-    return np.asarray(options.coverage_factor * np.sqrt(1.0 / worst + options.common_mm**2))
+    return np.asarray(COVERAGE_FACTOR * np.sqrt(1.0 / worst + COMMON_MM**2))
 
 
-def expected_error(information: Array, options: InformationOptions | None = None) -> Array:
+def expected_error(information: Array) -> Array:
     """(...,) root mean square length of the error of a place times the coverage factor, mm."""
-    options = options or InformationOptions()
     values = np.maximum(np.linalg.eigvalsh(information), 1e-12)
-    return np.asarray(options.coverage_factor * np.sqrt(np.sum(1.0 / values + options.common_mm**2, axis=-1)))
+    return np.asarray(COVERAGE_FACTOR * np.sqrt(np.sum(1.0 / values + COMMON_MM**2, axis=-1)))
 
 
-def gains(known: KnownViews, views: Views, weights: Array, options: InformationOptions | None = None) -> Array:
+def gains(known: KnownViews, views: Views, weights: Array) -> Array:
     """(V,) by how much each of some views lowers the weighted sum of expected errors of components.
 
     Args:
         known: the photos taken.
         views: the views.
         weights: (C,) of the components, 1/mm: one over the tolerance.
-        options: see `InformationOptions`.
     """
-    before = expected_error(known.information(), options) @ weights
-    return np.asarray(before - expected_error(known.with_each(views), options) @ weights)
+    before = expected_error(known.information()) @ weights
+    return np.asarray(before - expected_error(known.with_each(views)) @ weights)
 
 
 def choose_views(
@@ -192,7 +186,6 @@ def choose_views(
     taken_directions: Sequence[Array],
     count: int,
     max_step_deg: float,
-    options: InformationOptions | None = None,
 ) -> list[int]:
     """Indices of views to take, the next one first: each lowers the weighted sum of errors most after those before it.
 
@@ -207,9 +200,8 @@ def choose_views(
         taken_directions: unit vectors (3,) to the photos taken.
         count: largest number of views.
         max_step_deg: see above.
-        options: see `InformationOptions`.
     """
-    known = KnownViews(taken, options)
+    known = KnownViews(taken)
     left = np.ones(len(views), dtype=bool)
     nearest = np.full(len(views), -1.0)
     if len(taken_directions):
@@ -220,7 +212,7 @@ def choose_views(
         in_reach = left & (is_first | (nearest >= np.cos(np.deg2rad(max_step_deg))))
         if in_reach.any():
             some = np.flatnonzero(in_reach)
-            best = int(some[np.argmax(gains(known, views[some], weights, options))])
+            best = int(some[np.argmax(gains(known, views[some], weights))])
         else:
             best = int(np.argmax(np.where(left, nearest, -np.inf)))
         chosen.append(best)

@@ -20,9 +20,23 @@ from arview.capture.information import (
     focal_px,
     gains,
 )
-from arview.capture.options import CaptureOptions
+from arview.capture.options import MAX_STEP_DEG, CaptureOptions
 from arview.geometry import Array, apply
-from arview.reconstruction.coverage import components_seen, count_separated, unit
+from arview.reconstruction.coverage import (
+    DIRECTION_DEG,
+    DIRECTIONS_WANTED,
+    PHOTOS_WANTED,
+    components_seen,
+    count_separated,
+    unit,
+)
+
+APART_SHARE = 0.6
+"""Of the distance of two directions by which two photos differ at least."""
+U_SHARE = 0.25
+"""Of the tolerance: a predicted U below it is enough."""
+REACH_SHARE = 2.0
+"""Of the U that photos from all directions would give: below it is enough, too."""
 
 
 class CaptureNeeds:
@@ -43,13 +57,11 @@ class CaptureNeeds:
         self._center = part.model.center_in_model
         self._is_asked = asked_components(part, options.components)
         self._weights = component_weights(part) * self._is_asked
-        self._known: KnownViews = KnownViews(dome.views[:0], options.information)
-        self._reach_mm: Array = expanded_uncertainty(
-            KnownViews(dome.views, options.information).information(), options.information
-        )
+        self._known: KnownViews = KnownViews(dome.views[:0])
+        self._reach_mm: Array = expanded_uncertainty(KnownViews(dome.views).information())
         self._directions: list[Array] = []
         self._tolerances = [part.component_settings(one.name).position_tolerance_mm for one in part.model.components]
-        self.apart_deg = options.apart_share * dome.cell_deg
+        self.apart_deg = APART_SHARE * dome.cell_deg
         self.filled: set[int] = set()
         self.plan: list[int] = []
         self.best_gain = 0.0
@@ -80,7 +92,7 @@ class CaptureNeeds:
 
     def add(self, cam_from_model: Array) -> None:
         """Count a photo at a pose (4,4)."""
-        seen = np.array(components_seen(self._model, self._camera, cam_from_model, self._options.coverage))
+        seen = np.array(components_seen(self._model, self._camera, cam_from_model))
         eye = -cam_from_model[:3, :3].T @ cam_from_model[:3, 3]
         direction = unit(eye - self._center)
         self._known.add(self._view(seen, eye))
@@ -106,7 +118,7 @@ class CaptureNeeds:
         size = np.array([self._camera.width, self._camera.height])
         inside = np.all((pixels > 0) & (pixels < size - 1), axis=1)
         view = self._view(self._dome.is_seen[cell] & inside, eye)
-        return float(gains(self._known, view, self._weights, self._options.information)[0])
+        return float(gains(self._known, view, self._weights)[0])
 
     def hidden_from(self, cell: int) -> list[str]:
         """Names of the components that lack photos and are not seen from a cell, the neediest first."""
@@ -126,7 +138,7 @@ class CaptureNeeds:
     def _view(self, seen: NDArray[np.bool_], eye: Array) -> Views:
         """The view of a camera at a place (3,) that shows some components (C,)."""
         focal = focal_px(self._camera) * self._options.photo_px_per_px
-        return Views.of(self._points, seen[None], eye[None], focal, self._options.information)
+        return Views.of(self._points, seen[None], eye[None], focal)
 
     def _row(self, index: int, cell: int | None) -> ComponentNeed:
         u_mm, is_enough, can_be_seen = self._state
@@ -136,7 +148,7 @@ class CaptureNeeds:
             lacking = words.NEVER_SEEN()
         elif self._is_asked[index] and not is_enough[index]:
             is_hidden = cell is not None and not self._dome.is_seen[cell, index]
-            lacking = words.lacking_message(self._options.coverage.photos_wanted - photos, is_hidden)
+            lacking = words.lacking_message(PHOTOS_WANTED - photos, is_hidden)
         predicted = float(u_mm[index]) if photos >= 2 else None
         return ComponentNeed(
             self._model.components[index].name, photos, directions, predicted, bool(is_enough[index]), lacking
@@ -145,13 +157,12 @@ class CaptureNeeds:
     def _counts(self, index: int, views: Views) -> tuple[int, int]:
         """Photos that show a component, and the directions of these that differ."""
         rays = views.rays[views.is_seen[:, index], index]
-        return len(rays), count_separated(rays, self._options.coverage.direction_deg)
+        return len(rays), count_separated(rays, DIRECTION_DEG)
 
     def _assess(self, known: KnownViews | None = None) -> tuple[Array, NDArray[np.bool_], NDArray[np.bool_]]:
         """For some photos, by default those taken: (C,) U, which components have enough, and which can be seen."""
-        o = self._options
         known = known or self._known
-        u_mm = expanded_uncertainty(known.information(), o.information)
+        u_mm = expanded_uncertainty(known.information())
         cells = self._dome.is_seen.sum(axis=0)
         is_enough = np.zeros(len(u_mm), dtype=bool)
         can_be_seen = cells > 0
@@ -160,10 +171,10 @@ class CaptureNeeds:
             can_be_seen[index] |= photos > 0
             if not can_be_seen[index]:
                 continue
-            goal_mm = max(o.reach_share * float(self._reach_mm[index]), o.u_share * (tolerance or 0.0))
-            wanted = min(o.coverage.photos_wanted, photos + int(cells[index]))
+            goal_mm = max(REACH_SHARE * float(self._reach_mm[index]), U_SHARE * (tolerance or 0.0))
+            wanted = min(PHOTOS_WANTED, photos + int(cells[index]))
             is_enough[index] = (
-                photos >= wanted and directions >= min(o.coverage.directions_wanted, wanted) and u_mm[index] <= goal_mm
+                photos >= wanted and directions >= min(DIRECTIONS_WANTED, wanted) and u_mm[index] <= goal_mm
             )
         return u_mm, is_enough, can_be_seen
 
@@ -188,14 +199,14 @@ class CaptureNeeds:
         views, directions = self._dome.views[cells], self._dome.directions[cells]
         order = choose_views(
             self._known.views, views, self._weights, directions, self._directions,
-            min(len(cells), o.max_photos - self.photos), o.max_step_deg, o.information,
+            min(len(cells), o.max_photos - self.photos), MAX_STEP_DEG,
         )  # fmt: skip
-        self.best_gain = float(gains(self._known, views, self._weights, o.information).max())
+        self.best_gain = float(gains(self._known, views, self._weights).max())
         self.plan = self._until_enough([int(cells[index]) for index in order])
 
     def _until_enough(self, order: list[int]) -> list[int]:
         """The first cells of an order that suffice."""
-        known = KnownViews(self._known.views, self._options.information)
+        known = KnownViews(self._known.views)
         for index, cell in enumerate(order):
             known.add(self._dome.views[cell : cell + 1])
             is_near_end = len(known.views) >= self._options.wanted_photos

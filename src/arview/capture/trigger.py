@@ -14,6 +14,19 @@ from arview.capture.options import TriggerOptions
 from arview.geometry import Array, apply
 from arview.reconstruction.intake.checks import blur_and_texture
 
+GYRO_RAD_S = (0.12, 0.2)
+"""A hand that holds still trembles with about 0.05 rad/s."""
+WINDOW_S = 0.12
+"""Over which motion is measured: a tracker's noise is small beside it."""
+MAX_GAP_S = 0.8
+"""Between two frames; after a longer gap the motion is unknown."""
+FOCUS_MEMORY_S = 2.0
+"""Sharpness is compared with frames of this time."""
+MAX_BLUR_PX = 2.5
+"""Edge spread of a frame that is out of focus …."""
+MAX_BLUR_RATIO = 1.6
+"""… unless no frame of this stream was much sharper."""
+
 
 @dataclass
 class Hysteresis:
@@ -44,7 +57,7 @@ class MotionMonitor:
         self._options = options
         self._seen: deque[tuple[float, Array]] = deque()
         self._motion = Hysteresis(*options.motion_per_s)
-        self._gyro = Hysteresis(*options.gyro_rad_s, is_on=True)
+        self._gyro = Hysteresis(*GYRO_RAD_S, is_on=True)
         self._still_since_s: float | None = None
 
     def forget(self) -> None:
@@ -62,12 +75,12 @@ class MotionMonitor:
             gyro_rad_s: rate of turn by the gyroscope, None without one.
         """
         o = self._options
-        if self._seen and not 0.0 < time_s - self._seen[-1][0] <= o.max_gap_s:
+        if self._seen and not 0.0 < time_s - self._seen[-1][0] <= MAX_GAP_S:
             self.forget()
         pixels = self._camera.project(apply(cam_from_model, self._corners))
         self._seen.append((time_s, pixels))
         # The frames of the window, and one before it.
-        while len(self._seen) > 2 and time_s - self._seen[1][0] >= o.window_s:
+        while len(self._seen) > 2 and time_s - self._seen[1][0] >= WINDOW_S:
             self._seen.popleft()
         then_s, then = self._seen[0]
         if time_s <= then_s:
@@ -104,7 +117,7 @@ class FocusMonitor:
         o = self._options
         contrast = float(gray.var())
         sharpness = float(cv2.Laplacian(gray, cv2.CV_32F).var()) / max(contrast, 1.0)
-        while self._recent and not 0.0 <= time_s - self._recent[0][0] <= o.focus_memory_s:
+        while self._recent and not 0.0 <= time_s - self._recent[0][0] <= FOCUS_MEMORY_S:
             self._recent.popleft()
         self._recent.append((time_s, sharpness))
         usual = float(np.percentile([value for _, value in self._recent], 80))
@@ -115,12 +128,11 @@ class FocusMonitor:
 
         It takes some milliseconds, so it is asked only before a photo.
         """
-        o = self._options
         blur_px, _ = blur_and_texture(gray)
         if not np.isfinite(blur_px):  # too few edges to tell
             return True
         self._smallest_blur_px = min(self._smallest_blur_px, blur_px)
-        return blur_px <= max(o.max_blur_px, o.max_blur_ratio * self._smallest_blur_px)
+        return blur_px <= max(MAX_BLUR_PX, MAX_BLUR_RATIO * self._smallest_blur_px)
 
 
 def middle_of_part(image_rgb: NDArray[np.uint8], pixels: Array, side_px: int) -> NDArray[np.uint8]:

@@ -16,15 +16,10 @@ FIRST = "0" * 64
 """What the first entry names in place of the hash of an entry before it."""
 
 
-@dataclass(frozen=True)
-class EntryLimits:
-    """Longest texts of an entry, in characters: what a person writes, not what a program could send."""
-
-    name: int = 200  # names of people, components and photos
-    text: int = 4000  # reasons and notes
-
-
-LIMITS = EntryLimits()
+NAME = 200
+"""Names of people, components and photos."""
+TEXT = 4000
+"""Reasons and notes."""
 
 
 @dataclass(frozen=True)
@@ -135,7 +130,7 @@ def checked_name(value: object, what: str, required: bool = True) -> str:
     Raises:
         InputError: it is no text, empty though required, too long, or holds control characters.
     """
-    return _checked(value, what, LIMITS.name, required, "")
+    return _checked(value, what, NAME, required, "")
 
 
 def checked_text(value: object, what: str, required: bool = False) -> str:
@@ -144,7 +139,7 @@ def checked_text(value: object, what: str, required: bool = False) -> str:
     Raises:
         InputError: as `checked_name`; line ends and tabs are allowed.
     """
-    return _checked(value, what, LIMITS.text, required, "\n\t")
+    return _checked(value, what, TEXT, required, "\n\t")
 
 
 def _checked(value: object, what: str, longest: int, required: bool, allowed: str) -> str:

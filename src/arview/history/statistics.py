@@ -16,17 +16,20 @@ _D2, _D4 = 1.128, 3.267
 """Factors of moving ranges of two: mean range over standard deviation; upper limit over mean range (ISO 7870-2)."""
 
 
-@dataclass(frozen=True)
-class StatisticsOptions:
-    """Numbers of values and thresholds of charts and capability indices."""
-
-    min_chart_values: int = 8  # values needed for control limits
-    min_capability_values: int = 10  # values needed for capability indices
-    enough_values: int = 50  # with fewer values the indices come with a warning
-    same_side_run: int = 8  # consecutive values on one side of the mean that are a signal
-    trend_run: int = 6  # consecutive rising or falling values that are a signal
-    normality_level: float = 0.01  # significance level of the Shapiro-Wilk test
-    max_measurement_share: float = 0.3  # share of the variance due to the measurement above which there is a warning
+MIN_CHART_VALUES = 8
+"""Values needed for control limits."""
+MIN_CAPABILITY_VALUES = 10
+"""Values needed for capability indices."""
+ENOUGH_VALUES = 50
+"""With fewer values the indices come with a warning."""
+SAME_SIDE_RUN = 8
+"""Consecutive values on one side of the mean that are a signal."""
+TREND_RUN = 6
+"""Consecutive rising or falling values that are a signal."""
+NORMALITY_LEVEL = 0.01
+"""Significance level of the Shapiro-Wilk test."""
+MAX_MEASUREMENT_SHARE = 0.3
+"""Share of the variance due to the measurement above which there is a warning."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +92,7 @@ class Capability:
         return ("Cp", "Cpk") if self.is_in_control else ("Pp", "Ppk")
 
 
-def control_chart(values: ArrayLike, is_length: bool = False, options: StatisticsOptions | None = None) -> ControlChart:
+def control_chart(values: ArrayLike, is_length: bool = False) -> ControlChart:
     """Control limits from the mean moving range, which, unlike the standard deviation, is insensitive to drift.
 
     Signals are a value beyond 3 standard deviations, 8 consecutive values on one side of the mean, and 6 consecutive
@@ -99,24 +102,22 @@ def control_chart(values: ArrayLike, is_length: bool = False, options: Statistic
     Args:
         values: (N,) values in their order.
         is_length: whether the values, and thus the lower limit, cannot be negative.
-        options: see `StatisticsOptions`.
 
     Raises:
         InputError: there are fewer than 8 values, or one is not finite.
     """
-    options = options or StatisticsOptions()
-    x = _checked(values, options.min_chart_values, "control limits")
+    x = _checked(values, MIN_CHART_VALUES, "control limits")
     ranges = np.abs(np.diff(x))
     center, mean_range = float(x.mean()), float(ranges.mean())
     reach = 3.0 * mean_range / _D2
     signals: dict[int, str] = {}
     for index in np.flatnonzero(np.abs(x - center) > reach):
         signals[int(index)] = "beyond the control limits"
-    run = options.same_side_run
+    run = SAME_SIDE_RUN
     _add_runs(signals, np.sign(x - center), run, f"{run} in a row on one side of the mean")
     # Six points in a row that rise are five steps of one sign.
     steps = np.concatenate([[0.0], np.sign(np.diff(x))])
-    _add_runs(signals, steps, options.trend_run - 1, f"{options.trend_run} in a row that rise or fall")
+    _add_runs(signals, steps, TREND_RUN - 1, f"{TREND_RUN} in a row that rise or fall")
     lower = max(0.0, center - reach) if is_length else center - reach
     return ControlChart(
         x, center, lower, center + reach, ranges, mean_range, _D4 * mean_range, dict(sorted(signals.items()))
@@ -128,7 +129,6 @@ def capability(
     lower: float | None,
     upper: float | None,
     stds: Sequence[float | None] | None = None,
-    options: StatisticsOptions | None = None,
 ) -> Capability:
     """Cp and Cpk from the sample standard deviation, with 95 % confidence intervals.
 
@@ -139,20 +139,17 @@ def capability(
         values: (N,) values.
         lower, upper: tolerance limits, of which at least one is needed.
         stds: standard uncertainties of the measurements, as far as they are known.
-        options: see `StatisticsOptions`.
 
     Raises:
         InputError: there is no limit, there are fewer than 10 values, one is not finite, or all are equal.
     """
     from scipy import stats
 
-    options = options or StatisticsOptions()
-
     if lower is None and upper is None:
         raise InputError("capability: there is no tolerance; give a limit with --lower or --upper")
     if lower is not None and upper is not None and lower >= upper:
         raise InputError(f"capability: the lower limit {lower:g} is not less than the upper one {upper:g}")
-    x = _checked(values, options.min_capability_values, "Cp and Cpk")
+    x = _checked(values, MIN_CAPABILITY_VALUES, "Cp and Cpk")
     count, mean, std = len(x), float(x.mean()), float(x.std(ddof=1))
     if std < 1e-12:
         raise InputError(f"capability: all {count} values are equal")
@@ -167,13 +164,13 @@ def capability(
     cpk = min(sides)
     spread = float(stats.norm.ppf(0.975)) * float(np.sqrt(1.0 / (9.0 * count) + cpk**2 / (2.0 * free)))
     warnings = []
-    if count < options.enough_values:
-        enough = options.enough_values
+    if count < ENOUGH_VALUES:
+        enough = ENOUGH_VALUES
         warnings.append(f"only {count} values: the indices are rough, see their intervals ({enough} are enough)")
-    chart = control_chart(x, options=options)
+    chart = control_chart(x)
     if not chart.is_in_control:
         warnings.append("the process is not in control: Pp and Ppk describe the past, not the future")
-    if float(stats.shapiro(x[:5000]).pvalue) < options.normality_level:
+    if float(stats.shapiro(x[:5000]).pvalue) < NORMALITY_LEVEL:
         warnings.append(
             "the values are not normally distributed (Shapiro–Wilk, 1 %): the indices do not predict reject rates"
         )
@@ -181,7 +178,7 @@ def capability(
     share = None
     if known:
         share = min(1.0, float(np.mean(np.square(known))) / std**2)
-        if share > options.max_measurement_share:
+        if share > MAX_MEASUREMENT_SHARE:
             warnings.append(f"{share:.0%} of the variance is due to the measurement, not to the parts")
     return Capability(
         count, mean, std, lower, upper, cp, cp_interval, cpk, (cpk - spread, cpk + spread), chart.is_in_control, share,
@@ -189,9 +186,7 @@ def capability(
     )  # fmt: skip
 
 
-def capability_by_limits(
-    series: ComponentSeries, options: StatisticsOptions | None = None
-) -> dict[tuple[float | None, float | None], Capability | InputError]:
+def capability_by_limits(series: ComponentSeries) -> dict[tuple[float | None, float | None], Capability | InputError]:
     """Cp and Cpk of the values of each pair of limits, so that each value is judged by the limits that held for it.
 
     Where the indices cannot be given, the reason stands in their place.
@@ -200,7 +195,7 @@ def capability_by_limits(
     for (lower, upper), values in series.by_limits().items():
         try:
             stds = [one.std for one in values]
-            found[lower, upper] = capability([one.value for one in values], lower, upper, stds, options)
+            found[lower, upper] = capability([one.value for one in values], lower, upper, stds)
         except InputError as error:
             found[lower, upper] = error
     return found

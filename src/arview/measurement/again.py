@@ -67,7 +67,7 @@ def measure_again(
         first = replace(reconstruction, sparse=earlier)
         datums = measure_all(first, views, part, base, options, tell)
         tell("datums", 0, 1)
-        alignment, failed = align_to_datums(first, views, part, base, datums, options)
+        alignment, failed = align_to_datums(first, views, part, base, datums)
         results = measure_all(
             replace(reconstruction, sparse=later), load_views(later, part.model), part, components, options, tell
         )

@@ -33,7 +33,7 @@ from arview.measurement.measurand import Measurand
 from arview.measurement.options import ComponentMeasurement, MeasureOptions, combined_of
 from arview.measurement.photo.patches import free_directions
 from arview.measurement.types import Move
-from arview.measurement.uncertainty.budget import MeasuredPlacement, place, relative_twists
+from arview.measurement.uncertainty.budget import FORM_MM, PROBABILITY, K, MeasuredPlacement, place, relative_twists
 from arview.measurement.uncertainty.combine import Agreement, CombinedMove, agreements, quantile_of_length
 from arview.measurement.uncertainty.decision import decide, worst, zone_diameter_mm
 from arview.measurement.uncertainty.pose_propagation import PosePropagation
@@ -305,11 +305,11 @@ def provenance_of(reconstruction: MetricReconstruction, options: MeasureOptions,
     asked = {
         "methods": ",".join(options.methods),
         "guard": f"{options.decision.guard:g}",
-        "k": f"{options.uncertainty.k:g}",
-        "probability": f"{options.uncertainty.probability:g}",
+        "k": f"{K:g}",
+        "probability": f"{PROBABILITY:g}",
         "monte_carlo": str(options.uncertainty.draws if options.uncertainty.monte_carlo else 0),
         "seed": str(options.uncertainty.seed),
-        "form_mm": f"{options.uncertainty.form_mm:g}",
+        "form_mm": f"{FORM_MM:g}",
         "corrects_bias": str(options.corrects_bias).lower(),
     }
     return Provenance(

@@ -46,6 +46,9 @@ from arview.measurement.uncertainty.combine import CombinedMove
 from arview.measurement.uncertainty.pose_propagation import PosePropagation
 from arview.reconstruction.scale.cad import base_names
 
+ROUGH_STD_MM = 0.3
+"""Standard uncertainty of the rough frame, where neither datums nor base give a frame."""
+
 
 def measure(
     reconstruction: MetricReconstruction | str | Path, part: Part, options: MeasureOptions | None = None,
@@ -97,7 +100,7 @@ def _measure(
     views = load_views(replace(reconstruction.sparse, pose_covariance=None), part.model) if has_photos else None
     results = measure_all(reconstruction, views, part, [*base, *names], options, tell)
     tell("datums", 0, 1)
-    alignment, failed = align_to_datums(reconstruction, views, part, base, results, options)
+    alignment, failed = align_to_datums(reconstruction, views, part, base, results)
     warnings += [*(failed_datum_text(one) for one in failed), *datum_doubts(alignment)]
     poses = None
     if views is None:
@@ -143,7 +146,7 @@ def measure_all(
         def step(name: str, share: float) -> None:
             tell("components", round(share * len(names)), len(names))
 
-        both = measure_components_in_photos(views, part, part.model, options.photo, step, names)
+        both = measure_components_in_photos(views, part, part.model, step, names)
         for name, by_method in both.items():
             found[name] += [by_method[method] for method in options.methods if method in by_method]
     if "cloud" in options.methods and reconstruction.cloud is not None:
@@ -180,7 +183,7 @@ def measure_all(
 
 def align_to_datums(
     reconstruction: MetricReconstruction, views: PhotoViews | None, part: Part, base: Sequence[str],
-    results: Mapping[str, ComponentMeasurement], options: MeasureOptions,
+    results: Mapping[str, ComponentMeasurement],
 ) -> tuple[Alignment, tuple[FailedDatum, ...]]:  # fmt: skip
     """The datum frame of the part file, and the datums that could not be measured.
 
@@ -194,12 +197,11 @@ def align_to_datums(
     fits = {name: _rest_of_base(results[name], fitted[name], part) for name in base if name in fitted}
     rest = next(iter(fits.values()), None)
     found = measure_each(
-        part.datums, _datum_measurement(reconstruction, views, part, fitted, options), part.model, rest,
-        options.alignment,
+        part.datums, _datum_measurement(reconstruction, views, part, fitted), part.model, rest,
     )  # fmt: skip
     equations = found.equations
     if not part.datums and views is not None:
-        equations = _plane_of_base(views, part.model, base, options)
+        equations = _plane_of_base(views, part.model, base)
         if equations and base[0] in fitted:
             rest = _rest_of_base(results[base[0]], fitted[base[0]], part, is_flat=True)
     if rest is None and not equations:
@@ -216,44 +218,41 @@ def align_to_datums(
     scale_std = reconstruction.scale.scale_std or 0.0
     finds_scale = bool(kinds) and kinds <= {"cad"}
     if found.failed and rest is None:
-        rest = _rough_frame(origin, size_mm, options)
-    return align(equations, origin, size_mm, rest, scale_std, finds_scale, options.alignment), found.failed
+        rest = _rough_frame(origin, size_mm)
+    return align(equations, origin, size_mm, rest, scale_std, finds_scale), found.failed
 
 
 def _datum_measurement(
     reconstruction: MetricReconstruction, views: PhotoViews | None, part: Part, fitted: Mapping[str, Move],
-    options: MeasureOptions,
 ) -> MeasureDatum:  # fmt: skip
     """The function that measures one datum, in the photos or in the cloud."""
 
     def measure_one(datum: Datum) -> DatumEquations:
         if views is not None:
-            return measure_datums_in_photos((datum,), views, fitted, options.datums)[0]
+            return measure_datums_in_photos((datum,), views, fitted)[0]
         assert reconstruction.cloud is not None
-        return measure_datums_in_cloud((datum,), part.model, reconstruction.cloud, fitted, options.datums)[0]
+        return measure_datums_in_cloud((datum,), part.model, reconstruction.cloud, fitted)[0]
 
     return measure_one
 
 
-def _rough_frame(origin: Array, size_mm: float, options: MeasureOptions) -> DatumEquations:
+def _rough_frame(origin: Array, size_mm: float) -> DatumEquations:
     """Equations of the rough frame of the reconstruction, for what neither datums nor base determine."""
-    std = options.rough_std_mm
+    std = ROUGH_STD_MM
     covariance = np.diag([(std / size_mm) ** 2] * 3 + [std**2] * 3)
     move = Move("part", "sweep", origin, np.zeros(6), covariance, np.zeros((0, 6)), size_mm, 0, 0.0, 1.0)
     return move_equations("the rough frame", move)[0]
 
 
-def _plane_of_base(
-    views: PhotoViews, model: Model, base: Sequence[str], options: MeasureOptions
-) -> list[DatumEquations]:
+def _plane_of_base(views: PhotoViews, model: Model, base: Sequence[str]) -> list[DatumEquations]:
     """Equations of the base's large flat face, whose height is known better than that of its edges; or none."""
     component = model.component(base[0])
     plane = base_plane(component, views.centres.mean(axis=0) - component.bounds_in_model.mean(axis=0))
     if plane is None:
         return []
     try:
-        equations = measure_datums_in_photos((plane,), views, {}, options.datums)
-        check_covered(equations[0], options.alignment)
+        equations = measure_datums_in_photos((plane,), views, {})
+        check_covered(equations[0])
     except InputError:
         return []
     return equations

@@ -31,6 +31,9 @@ from arview.overlay.options import OverlayOptions
 from arview.overlay.status import StatusLine
 from arview.pose import ComponentPresence, Pose, TrackingState
 
+SHOW_ARROWS = True
+"""Draw displacements as arrows."""
+
 _SAME_PLACE = 0.02
 """Distance in diameters within which a component is at one place in all ambiguous poses."""
 _CRITICAL_DIMMING = 0.55
@@ -268,7 +271,7 @@ class OverlayRenderer:
         arrows = self._arrows_in_model([DrawnEvidence.SEEN] * len(self._names))
         return StatusLine(
             self.camera.width, self.camera.height, round(0.95 * self._size_px), self.inspection,
-            self._arrow_scale if self.options.show_arrows and len(arrows) else None,
+            self._arrow_scale if SHOW_ARROWS and len(arrows) else None,
             len(self._names) > 1 and self.options.show_evidence, bool(self._pending),
         )  # fmt: skip
 
@@ -301,7 +304,7 @@ class OverlayRenderer:
             index = {name: number for number, name in enumerate(self._names)}
             wanted = labels.text_urgency(self._names, self.inspection, by_name, self._pending)
             order = tuple(index[name] for name in wanted) if self.options.show_labels and not is_withheld else ()
-            arrows = self._arrows_in_model(list(evidence)) if self.options.show_arrows else np.zeros((0, 2, 3))
+            arrows = self._arrows_in_model(list(evidence)) if SHOW_ARROWS else np.zeros((0, 2, 3))
             self._scene = _PartLook(key, evidence, styles, order, arrows, {})
         return self._scene
 

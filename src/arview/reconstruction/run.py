@@ -72,13 +72,15 @@ VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".m
 """Files with these suffixes are videos."""
 
 
+SCALE = CadOptions()
+
+
 @dataclass(frozen=True)
 class ReconstructOptions:
     """Options of the stages, and the last stage to run."""
 
     video: VideoIntakeOptions = field(default_factory=VideoIntakeOptions)
     sparse: SparseOptions = field(default_factory=SparseOptions)
-    scale: CadOptions = field(default_factory=CadOptions)
     sources: ScaleSources = field(default_factory=ScaleSources)
     dense: DenseOptions = field(default_factory=DenseOptions)
     poses: Path | None = None  # camera poses made elsewhere, see `given_poses`; None: structure from motion
@@ -189,7 +191,7 @@ class _ReconstructionRun:
             sparse = self._sparse(intake.photos, key)
         if last >= 2 and sparse is not None:
             part_key = None if self.part is None else (self.part.model.source_hash, self.part.effective_view_range)
-            key = key_of(key, part_key, self.options.sources, self.options.scale)
+            key = key_of(key, part_key, self.options.sources, SCALE)
             scale = self._scale(intake.photos, sparse, key)
             sparse, cad = self._metric(sparse, scale)
             cover = self._coverage(sparse, cad)
@@ -278,7 +280,7 @@ class _ReconstructionRun:
         if self.stages.is_finished("scale", key):
             return ScaleResult.from_provenance(json.loads(path.read_text(encoding="utf-8")))
         self._restart("scale")
-        scale = find_scale(sparse, self.part, self.options.sources, self.options.scale, progress=self.tell)
+        scale = find_scale(sparse, self.part, self.options.sources, SCALE, progress=self.tell)
         # The scale's file carries all doubts about the reconstruction to the measurement and its report.
         apart = groups_warning([photo.name for photo in photos], sparse.groups)
         scale = replace(scale, warnings=(*sparse.remarks, *((apart,) if apart else ()), *scale.warnings))

@@ -2,6 +2,5 @@
 
 from arview.report.evidence import ReportEvidence, gather
 from arview.report.make import make_report
-from arview.report.page import ReportOptions
 
-__all__ = ["ReportEvidence", "ReportOptions", "gather", "make_report"]
+__all__ = ["ReportEvidence", "gather", "make_report"]

@@ -1,14 +1,12 @@
 """Rework: which way and how far a component out of tolerance is to be moved, in directions that a fitter has."""
 
-from arview.rework.drawing import DrawingOptions, drawing_svg
-from arview.rework.instructions import ReworkOptions, instructions
+from arview.rework.drawing import drawing_svg
+from arview.rework.instructions import instructions
 from arview.rework.types import Instruction, ReworkMove, ReworkTurn, instruction_document
 
 __all__ = [
-    "DrawingOptions",
     "Instruction",
     "ReworkMove",
-    "ReworkOptions",
     "ReworkTurn",
     "drawing_svg",
     "instruction_document",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from html import escape
 
 import numpy as np
@@ -17,24 +17,20 @@ from arview.inspection.rounding import exact
 from arview.rework import svg
 from arview.rework.correction import Correction, Standing, correction_of, standing_of
 from arview.rework.instructions import instructions
-from arview.rework.outline import LineOptions, ParallelView, Window, visible_lines
+from arview.rework.outline import ParallelView, Window, visible_lines
 from arview.rework.types import Instruction, ReworkMove
 from arview.rework.words import across, targets_of, up_of
 
-
-@dataclass(frozen=True)
-class DrawingOptions:
-    """Sizes of the drawing on paper, mm. 180 mm is the width of A4 between the margins of the report."""
-
-    width_mm: float = 180.0
-    plan_width_mm: float = 110.0
-    side_width_mm: float = 64.0
-    min_plan_height_mm: float = 64.0
-    max_plan_height_mm: float = 120.0
-    margin_mm: float = 14.0  # around the component in the plan
-    head_mm: float = 8.0  # for the name; the lines of the moves come on top
-    max_magnification: float = 200.0
-    lines: LineOptions = field(default_factory=LineOptions)
+WIDTH_MM = 180.0
+PLAN_WIDTH_MM = 110.0
+SIDE_WIDTH_MM = 64.0
+MIN_PLAN_HEIGHT_MM = 64.0
+MAX_PLAN_HEIGHT_MM = 120.0
+MARGIN_MM = 14.0
+"""Around the component in the plan."""
+HEAD_MM = 8.0
+"""For the name; the lines of the moves come on top."""
+MAX_MAGNIFICATION = 200.0
 
 
 @dataclass(frozen=True)
@@ -85,7 +81,6 @@ class _Subject:
     view: ParallelView
     nominal: Component
     measured: Component | None
-    options: DrawingOptions
 
     @property
     def design_point(self) -> Array:
@@ -96,7 +91,7 @@ class _Subject:
         return self.view.to_plane(self.standing.center_in_model - self.correction.shift_mm)[:2]
 
 
-def drawing_svg(part: Part, inspection: Inspection, component: str, options: DrawingOptions | None = None) -> str:
+def drawing_svg(part: Part, inspection: Inspection, component: str) -> str:
     """The drawing of a component as SVG, in mm: printed at 100 % its plan has the scale that it states.
 
     It shows the design outline (solid), the measured one (dashed), what is beside them, and magnified the displacement
@@ -112,29 +107,28 @@ def drawing_svg(part: Part, inspection: Inspection, component: str, options: Dra
         known = ", ".join(one.name for one in inspection.components)
         raise InputError(f"the inspection has no component {component!r}; it has: {known}")
     told = {one.component: one for one in instructions(part, inspection)}
-    o = options or DrawingOptions()
-    subject = _subject(part, deviation, told.get(component), o)
+    subject = _subject(part, deviation, told.get(component))
     low, high = _extent(subject)
-    scale = min(1.0, _scale_for(o.plan_width_mm, high[0] - low[0] + 2.0 * o.margin_mm),
-                _scale_for(o.max_plan_height_mm, high[1] - low[1] + 2.0 * o.margin_mm))  # fmt: skip
-    height = float(np.clip((high[1] - low[1] + 2.0 * o.margin_mm) * scale, o.min_plan_height_mm, o.max_plan_height_mm))
+    scale = min(1.0, _scale_for(PLAN_WIDTH_MM, high[0] - low[0] + 2.0 * MARGIN_MM),
+                _scale_for(MAX_PLAN_HEIGHT_MM, high[1] - low[1] + 2.0 * MARGIN_MM))  # fmt: skip
+    height = float(np.clip((high[1] - low[1] + 2.0 * MARGIN_MM) * scale, MIN_PLAN_HEIGHT_MM, MAX_PLAN_HEIGHT_MM))
     top, pieces = _head(subject, inspection)
-    plan = _Panel(0.3, top, o.plan_width_mm, height, 0.5 * (low + high), scale)
+    plan = _Panel(0.3, top, PLAN_WIDTH_MM, height, 0.5 * (low + high), scale)
     key = f"r{zlib.crc32(f'{part.name}/{inspection.serial}/{component}'.encode()):08x}"
     plan_bottom, drawn = _plan(subject, plan, f"{key}a")
-    side_bottom, side = _side(subject, o.width_mm - o.side_width_mm - 0.3, top, f"{key}b")
+    side_bottom, side = _side(subject, WIDTH_MM - SIDE_WIDTH_MM - 0.3, top, f"{key}b")
     pieces += drawn + side
     total = max(plan_bottom, side_bottom)
     what = subject.instruction.what if subject.instruction is not None else "nothing is asked for"
     label = escape(f"Rework of {component}: {what}. {subject.view.words}.", quote=True)
     return (
-        f'<svg xmlns="http://www.w3.org/2000/svg" width="{o.width_mm:g}mm" height="{total:.2f}mm" '
-        f'viewBox="0 0 {o.width_mm:g} {total:.2f}" font-family="{svg.FONT}" role="img" aria-label="{label}">'
-        f'<rect width="{o.width_mm:g}" height="{total:.2f}" fill="#fff"/>{"".join(pieces)}</svg>'
+        f'<svg xmlns="http://www.w3.org/2000/svg" width="{WIDTH_MM:g}mm" height="{total:.2f}mm" '
+        f'viewBox="0 0 {WIDTH_MM:g} {total:.2f}" font-family="{svg.FONT}" role="img" aria-label="{label}">'
+        f'<rect width="{WIDTH_MM:g}" height="{total:.2f}" fill="#fff"/>{"".join(pieces)}</svg>'
     )
 
 
-def _subject(part: Part, deviation: ComponentDeviation, told: Instruction | None, o: DrawingOptions) -> _Subject:
+def _subject(part: Part, deviation: ComponentDeviation, told: Instruction | None) -> _Subject:
     standing = standing_of(deviation, part)
     correction = correction_of(deviation, standing)
     nominal = part.model.component(deviation.name)
@@ -148,7 +142,7 @@ def _subject(part: Part, deviation: ComponentDeviation, told: Instruction | None
             place[:3, 3] = -correction.shift_mm
         measured = replace(nominal, vertices_in_model=apply(place, nominal.vertices_in_model))
     view = view_of(part, standing, correction)
-    return _Subject(part, deviation, standing, correction, told, view, nominal, measured, o)
+    return _Subject(part, deviation, standing, correction, told, view, nominal, measured)
 
 
 def view_of(part: Part, standing: Standing, correction: Correction) -> ParallelView:
@@ -201,14 +195,14 @@ def _head(subject: _Subject, inspection: Inspection) -> tuple[float, list[str]]:
     """Where the panels begin, and what is above them: name, part and moves."""
     told, name = subject.instruction, subject.deviation.name
     what = "nothing is asked for" if told is None else told.what
-    lines = svg.wrapped(f"{what[:1].upper()}{what[1:]}.", subject.options.width_mm, 3.2)
+    lines = svg.wrapped(f"{what[:1].upper()}{what[1:]}.", WIDTH_MM, 3.2)
     title = f"{inspection.part} {inspection.serial}".strip()
     pieces = [
         svg.text(0.0, 4.4, name, 4.6, f'fill="{svg.INK}" font-weight="600"'),
-        svg.text(subject.options.width_mm, 4.4, title, 2.8, f'fill="{svg.MUTED}" text-anchor="end"'),
+        svg.text(WIDTH_MM, 4.4, title, 2.8, f'fill="{svg.MUTED}" text-anchor="end"'),
     ]
     pieces += [svg.text(0.0, 9.0 + 4.0 * k, line, 3.2, f'fill="{svg.INK}"') for k, line in enumerate(lines)]
-    return subject.options.head_mm + 4.0 * len(lines), pieces
+    return HEAD_MM + 4.0 * len(lines), pieces
 
 
 def _framed(panel: _Panel, key: str, pieces: list[str]) -> list[str]:
@@ -222,17 +216,17 @@ def _framed(panel: _Panel, key: str, pieces: list[str]) -> list[str]:
 
 def _outlines(subject: _Subject, panel: _Panel, with_others: bool) -> list[str]:
     """Everything that a panel shows of the part: others thin, the design place solid, the measured one dashed."""
-    lines, view, window = subject.options.lines, subject.view, panel.window
+    view, window = subject.view, panel.window
     pieces = []
     if with_others:
         others = [one for one in subject.part.model.components if one.name != subject.nominal.name]
-        drawn = visible_lines(others, others, view, window, lines)
+        drawn = visible_lines(others, others, view, window)
         pieces.append(svg.path([panel.at(one) for one in drawn], f'stroke="{svg.PALE}" stroke-width="0.18"'))
-    design = visible_lines([subject.nominal], [subject.nominal], view, window, lines)
+    design = visible_lines([subject.nominal], [subject.nominal], view, window)
     width = 0.5 if panel.scale >= 0.2 else 0.35
     pieces.append(svg.path([panel.at(one) for one in design], f'stroke="{svg.DESIGN}" stroke-width="{width:g}"'))
     if subject.measured is not None:
-        measured = visible_lines([subject.measured], [subject.measured], view, window, lines)
+        measured = visible_lines([subject.measured], [subject.measured], view, window)
         attributes = f'stroke="{svg.MEASURED}" stroke-width="{0.8 * width:g}" stroke-dasharray="1.8 1"'
         pieces.append(svg.path([panel.at(one) for one in measured], attributes))
     return pieces
@@ -380,18 +374,16 @@ def _whole_part(subject: _Subject, x: float, y: float) -> _Panel:
     corners = np.array(np.meshgrid(*subject.part.model.bounds_in_model.T)).reshape(3, -1).T
     flat = subject.view.to_plane(corners)[:, :2]
     size = flat.max(axis=0) - flat.min(axis=0)
-    width = subject.options.side_width_mm
+    width = SIDE_WIDTH_MM
     scale = float(min((width - 4.0) / size[0], (width - 4.0) / size[1]))
     return _Panel(x, y, width, width, 0.5 * (flat.min(axis=0) + flat.max(axis=0)), scale)
 
 
 def _magnified(subject: _Subject, x: float, y: float) -> _Panel:
-    one, width = subject.deviation, subject.options.side_width_mm
+    one, width = subject.deviation, SIDE_WIDTH_MM
     away = float(np.hypot(*(subject.measured_point - subject.design_point)))
     reach = 1.15 * max(one.tolerance_mm or 0.0, away + (one.uncertainty_mm or 0.0), 1e-3)
-    scale = min(
-        subject.options.max_magnification, svg.nice(0.5 * width / reach, (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0))
-    )
+    scale = min(MAX_MAGNIFICATION, svg.nice(0.5 * width / reach, (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0)))
     return _Panel(x, y, width, width, subject.design_point, scale)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -17,7 +17,6 @@ from arview.rework.types import Instruction, ReworkMove, ReworkTurn
 from arview.rework.words import (
     NamedDirection,
     NamedStep,
-    NamingOptions,
     Target,
     across,
     aim_of,
@@ -32,18 +31,17 @@ MAX_DECIMALS = 2
 """A fitter reads hundredths of a millimetre and of a degree."""
 
 
-@dataclass(frozen=True)
-class ReworkOptions:
-    """What is asked for."""
+SIDEWAYS_SHARE = 0.25
+"""Of the tolerance: what may remain beside a move that is called by a near direction."""
+MIN_SHARE = 0.1
+"""Of the tolerance: shorter moves are not asked for either."""
+END_SHARE = 0.5
+"""Of the tolerance: a turn that moves the ends by more is asked for without an angle limit."""
+MIN_TURN_DEG = 0.02
+"""Below which no turn is asked for."""
 
-    sideways_share: float = 0.25  # of the tolerance: what may remain beside a move that is called by a near direction
-    min_share: float = 0.1  # of the tolerance: shorter moves are not asked for either
-    end_share: float = 0.5  # of the tolerance: a turn that moves the ends by more is asked for without an angle limit
-    min_turn_deg: float = 0.02  # below which no turn is asked for
-    naming: NamingOptions = field(default_factory=NamingOptions)
 
-
-def instructions(part: Part, inspection: Inspection, options: ReworkOptions | None = None) -> tuple[Instruction, ...]:
+def instructions(part: Part, inspection: Inspection) -> tuple[Instruction, ...]:
     """The rework of each component that is out of tolerance or missing, in the order of the inspection.
 
     Foreign objects and components whose verdict is undecided are no rework.
@@ -52,12 +50,11 @@ def instructions(part: Part, inspection: Inspection, options: ReworkOptions | No
         MismatchError: the inspection is of another model.
     """
     inspection.check_model(part.model)
-    o = options or ReworkOptions()
     failing = [one for one in inspection.components if one.verdict is Verdict.FAIL]
     absent = [one.name for one in failing if one.finding is Finding.MISSING]
     wrong = [one.name for one in failing]
     targets = targets_of(part, absent, wrong)
-    return tuple(_instruction(one, part, targets, o) for one in failing)
+    return tuple(_instruction(one, part, targets) for one in failing)
 
 
 @dataclass(frozen=True)
@@ -74,10 +71,10 @@ class _Names:
         return [*self.declared, *self.found]
 
 
-def _instruction(one: ComponentDeviation, part: Part, targets: Sequence[Target], o: ReworkOptions) -> Instruction:
+def _instruction(one: ComponentDeviation, part: Part, targets: Sequence[Target]) -> Instruction:
     settings = part.component_settings(one.name).rework
     standing = standing_of(one, part)
-    place = _place(standing, targets, o.naming)
+    place = _place(standing, targets)
     if one.finding is Finding.MISSING:
         install = (*INSTALL_STEPS, FIXING.get(settings.name, ANY_FIXING), LAST_STEP)
         steps = _filled(install, one.name, "", place)
@@ -85,9 +82,9 @@ def _instruction(one: ComponentDeviation, part: Part, targets: Sequence[Target],
             one.name, "install", "install it", text=settings.text, steps=steps, place=place, pictures=settings.pictures
         )  # fmt: skip
     correction = correction_of(one, standing)
-    names = names_for(standing, part, targets, settings, o.naming)
-    moves = _moves(one, standing, correction, names, part, o)
-    turn = _turn(one, standing, correction, names, part, o)
+    names = names_for(standing, part, targets, settings)
+    moves = _moves(one, standing, correction, names, part)
+    turn = _turn(one, standing, correction, names, part)
     texts = [move.text for move in moves] + ([] if turn is None else [turn.text])
     what = ", then ".join(texts) if texts else "bring it to its design place"
     if settings.name == "shim":
@@ -120,14 +117,10 @@ def _filled(steps: Sequence[str], component: str, move: str, place: str) -> tupl
     return tuple(filled)
 
 
-def names_for(
-    standing: Standing, part: Part, targets: Sequence[Target], settings: ReworkSettings, options: NamingOptions
-) -> _Names:
+def names_for(standing: Standing, part: Part, targets: Sequence[Target], settings: ReworkSettings) -> _Names:
     """Directions by which the moves of a component can be called."""
     normal = standing.normal_in_model
-    found = lateral_directions(
-        part, targets, standing.component, standing.center_in_model, normal, standing.seat, options
-    )
+    found = lateral_directions(part, targets, standing.component, standing.center_in_model, normal, standing.seat)
     known = {target.name: target for target in targets_of(part)}
     declared: list[NamedDirection] = []
     away, against = _seat_words(standing, part)
@@ -140,7 +133,7 @@ def names_for(
                 continue
         else:
             target = known.get(axis.target)
-            aim = None if target is None else aim_of(target, standing.center_in_model, normal, options)
+            aim = None if target is None else aim_of(target, standing.center_in_model, normal)
             if aim is None:
                 continue  # it is straight above or below, so that moves across the seat cannot be called by it
             direction = aim[0] if axis.verb == "towards" else -aim[0]
@@ -167,7 +160,7 @@ def _seat_words(standing: Standing, part: Part) -> tuple[str, str]:
 
 
 def _moves(
-    one: ComponentDeviation, standing: Standing, correction: Correction, names: _Names, part: Part, o: ReworkOptions
+    one: ComponentDeviation, standing: Standing, correction: Correction, names: _Names, part: Part
 ) -> tuple[ReworkMove, ...]:
     """The moves that are larger than their U and matter; all of them if the distance fails though none is."""
     if one.tolerance_mm is None:
@@ -177,15 +170,15 @@ def _moves(
     lateral = across(shift, normal)
     if np.linalg.norm(lateral) > 1e-9:
         axis = lateral / np.linalg.norm(lateral)
-        sideways = max(o.sideways_share * one.tolerance_mm, correction.shift_uncertainty_mm(axis))
-        steps = in_named_steps(lateral, names.declared, names.found, sideways, o.naming)
+        sideways = max(SIDEWAYS_SHARE * one.tolerance_mm, correction.shift_uncertainty_mm(axis))
+        steps = in_named_steps(lateral, names.declared, names.found, sideways)
     height = float(normal @ shift)
     if abs(height) > 1e-9:
         text = names.away if height > 0 else names.against
         direction = NamedDirection(normal * np.sign(height), text)
         steps.append(NamedStep(direction, direction.in_model, abs(height), direction.in_model))
     sized = [(step, correction.shift_uncertainty_mm(step.row)) for step in steps]
-    asked = [(step, u) for step, u in sized if step.length > max(u, o.min_share * one.tolerance_mm)]
+    asked = [(step, u) for step, u in sized if step.length > max(u, MIN_SHARE * one.tolerance_mm)]
     fails = one.distance_mm is not None and one.distance_mm > one.tolerance_mm
     if not asked and fails:
         asked = sized
@@ -202,28 +195,28 @@ def _move(step: NamedStep, uncertainty_mm: float) -> ReworkMove:
 
 
 def _turn(
-    one: ComponentDeviation, standing: Standing, correction: Correction, names: _Names, part: Part, o: ReworkOptions
+    one: ComponentDeviation, standing: Standing, correction: Correction, names: _Names, part: Part
 ) -> ReworkTurn | None:
     """The turn back to the design attitude, if it is larger than its U and matters."""
     rotation, own = correction.rotation_rad, standing.axis_in_model
     angle = float(np.linalg.norm(rotation))
-    if angle <= np.deg2rad(o.min_turn_deg):
+    if angle <= np.deg2rad(MIN_TURN_DEG):
         return None
     limit = None if one.details is None else one.details.angle_tolerance_deg
     ends_mm = angle * standing.radius_mm
-    if limit is None and (one.tolerance_mm is None or ends_mm <= o.end_share * one.tolerance_mm):
+    if limit is None and (one.tolerance_mm is None or ends_mm <= END_SHARE * one.tolerance_mm):
         return None
     texts, kept = [], np.zeros(3)
     tilt = across(rotation, own)
     size = float(np.linalg.norm(tilt))
     if size > 1e-9:
         u = correction.turn_uncertainty_rad(tilt / size)
-        if size > max(u, np.deg2rad(o.min_turn_deg)):
-            texts.append(_tilt_text(tilt, u, standing, names, o))
+        if size > max(u, np.deg2rad(MIN_TURN_DEG)):
+            texts.append(_tilt_text(tilt, u, standing, names))
             kept = kept + tilt
     twist = float(rotation @ own)
     u = correction.turn_uncertainty_rad(own)
-    if abs(twist) > max(u, np.deg2rad(o.min_turn_deg)):
+    if abs(twist) > max(u, np.deg2rad(MIN_TURN_DEG)):
         word = "counter-clockwise" if twist > 0 else "clockwise"
         texts.append(f"turn {_degrees(abs(twist), u)}° {word} {_seen(standing, part)}")
         kept = kept + own * twist
@@ -235,11 +228,11 @@ def _turn(
     return ReworkTurn(" and ".join(texts), _three(axis), float(np.rad2deg(angle)), float(np.rad2deg(u)))
 
 
-def _tilt_text(tilt: Array, u: float, standing: Standing, names: _Names, o: ReworkOptions) -> str:
+def _tilt_text(tilt: Array, u: float, standing: Standing, names: _Names) -> str:
     """The tilt by the directions in which the free end goes."""
     size = float(np.linalg.norm(tilt))
     lean = np.cross(tilt, standing.axis_in_model)
-    steps = in_named_steps(lean, names.declared, names.found, max(u, 0.25 * size), o.naming)
+    steps = in_named_steps(lean, names.declared, names.found, max(u, 0.25 * size))
     parts = [f"{_degrees(step.length, u)}° {step.direction.text}" for step in steps if step.length > u] or [
         f"{_degrees(size, u)}° {steps[0].direction.text}"
     ]
@@ -305,13 +298,13 @@ def _remark(
     return " ".join(dict.fromkeys(sentences))
 
 
-def _place(standing: Standing, targets: Sequence[Target], options: NamingOptions) -> str:
+def _place(standing: Standing, targets: Sequence[Target]) -> str:
     """Where a component belongs: on what, and how far from two things beside it in different directions."""
     aims = []
     for target in targets:
         aim = None
         if target.name not in (standing.component, standing.seat):
-            aim = aim_of(target, standing.center_in_model, standing.normal_in_model, options)
+            aim = aim_of(target, standing.center_in_model, standing.normal_in_model)
         if aim is not None and target.normal_in_model is None:
             aims.append((aim[1] * (1.0 + target.cost), target.name, *aim))
     aims.sort(key=lambda one: one[0])

@@ -41,19 +41,18 @@ class ParallelView:
         return np.asarray((points_in_model - self.origin_in_model) @ self.axes.T)
 
 
-@dataclass(frozen=True)
-class LineOptions:
-    """Resolution of the lines."""
-
-    crease_deg: float = 30.0  # angle between two faces above which their edge is drawn
-    pixels: int = 900  # of the z-buffer along the longer side of a window
-    step_px: float = 2.0  # distance of the points at which an edge is tested
-    max_faces: int = 400_000  # of components with more faces only the bounding box is drawn
+CREASE_DEG = 30.0
+"""Angle between two faces above which their edge is drawn."""
+PIXELS = 900
+"""Of the z-buffer along the longer side of a window."""
+STEP_PX = 2.0
+"""Distance of the points at which an edge is tested."""
+MAX_FACES = 400_000
+"""Of components with more faces only the bounding box is drawn."""
 
 
 def visible_lines(
     shown: Sequence[Component], hiding: Sequence[Component], view: ParallelView, window: Window,
-    options: LineOptions | None = None,
 ) -> list[Array]:  # fmt: skip
     """Polylines (K,2), mm in the drawing plane, of what is visible of components in a window.
 
@@ -62,22 +61,20 @@ def visible_lines(
         hiding: components behind which lines are hidden; those shown as well, for a drawing as it is seen.
         view: the view.
         window: part of the plane; lines that leave it are not cut exactly.
-        options: of the lines.
     """
-    o = options or LineOptions()
-    pitch = max(window[2] - window[0], window[3] - window[1]) / o.pixels
+    pitch = max(window[2] - window[0], window[3] - window[1]) / PIXELS
     heights = _heights(hiding, view, window, pitch)
     lines = []
     for component in shown:
         if not _touches(component, view, window):
             continue
-        if len(component.faces) > o.max_faces:
+        if len(component.faces) > MAX_FACES:
             low, high = view.to_plane(component.vertices_in_model)[:, :2].min(0), None
             high = view.to_plane(component.vertices_in_model)[:, :2].max(0)
             lines.append(np.array([low, [high[0], low[1]], high, [low[0], high[1]], low]))
             continue
-        starts, ends = _drawn_edges(component, view, o)
-        lines += _chained(_visible_pieces(starts, ends, heights, window, pitch, o))
+        starts, ends = _drawn_edges(component, view)
+        lines += _chained(_visible_pieces(starts, ends, heights, window, pitch))
     return lines
 
 
@@ -88,9 +85,9 @@ def _touches(component: Component, view: ParallelView, window: Window) -> bool:
     return bool(low[0] <= window[2] and high[0] >= window[0] and low[1] <= window[3] and high[1] >= window[1])
 
 
-def _drawn_edges(component: Component, view: ParallelView, o: LineOptions) -> tuple[Array, Array]:
+def _drawn_edges(component: Component, view: ParallelView) -> tuple[Array, Array]:
     """Ends (N,3) of the edges that are outlines or creases turned to the viewer, in the drawing plane."""
-    edges = mesh_edges(make_model(component.name, (component,)), o.crease_deg)
+    edges = mesh_edges(make_model(component.name, (component,)), CREASE_DEG)
     facing = edges.face_normals @ view.axes[2]
     is_open = edges.faces[:, 1] < 0
     first = facing[edges.faces[:, 0]] > 1e-4
@@ -121,14 +118,14 @@ def _heights(components: Sequence[Component], view: ParallelView, window: Window
 
 
 def _visible_pieces(
-    starts: Array, ends: Array, heights: Array, window: Window, pitch: float, o: LineOptions
+    starts: Array, ends: Array, heights: Array, window: Window, pitch: float
 ) -> list[tuple[Array, Array]]:
     """The pieces of edges that are not hidden, as pairs of points (2,)."""
     pieces: list[tuple[Array, Array]] = []
     if not len(starts):
         return pieces
     tolerance = 2.0 * pitch + 0.02
-    counts = np.maximum(1, np.ceil(np.linalg.norm((ends - starts)[:, :2], axis=1) / (o.step_px * pitch))).astype(int)
+    counts = np.maximum(1, np.ceil(np.linalg.norm((ends - starts)[:, :2], axis=1) / (STEP_PX * pitch))).astype(int)
     owner = np.repeat(np.arange(len(counts)), counts)
     place = (np.arange(len(owner)) - np.repeat(np.cumsum(counts) - counts, counts) + 0.5) / counts[owner]
     points = starts[owner] + place[:, None] * (ends - starts)[owner]

@@ -14,23 +14,31 @@ _SIDES = (("front", -90.0), ("back", 90.0), ("left", 180.0), ("right", 0.0))
 """Sides of a part and their azimuth in its upright frame, as in the guide views of these names."""
 
 
-@dataclass(frozen=True)
-class NamingOptions:
-    """Which directions are offered, and which names are taken before others (the lowest cost)."""
-
-    max_angle_deg: float = 22.0  # between a move and the direction by which it is called
-    min_pair_deg: float = 40.0  # between two directions into which a move is divided, and short of opposite ones
-    min_reach_mm: float = 5.0  # nearer targets give no direction
-    min_lateral_share: float = 0.5  # of the distance of a target that lies across the direction away from the seat
-    far_cost: float = 0.25  # for each doubling of the distance beyond the nearest target
-    max_far_cost: float = 1.0
-    component_cost: float = 0.1  # a component may be displaced itself; a datum feature is the reference
-    wrong_cost: float = 0.6  # a component that is out of tolerance
-    away_cost: float = 0.6  # "away from" is followed less surely than "towards", also the farther off
-    side_cost: float = 1.8  # sides of the part, where nothing better is there
-    pair_cost: float = 0.8  # two moves instead of one
-    oblique_cost: float = 0.6  # two directions that are 45° off the right angle
-    detour_cost: float = 2.0  # for each length of the move that two steps take more than two at a right angle can
+MAX_ANGLE_DEG = 22.0
+"""Between a move and the direction by which it is called."""
+MIN_PAIR_DEG = 40.0
+"""Between two directions into which a move is divided, and short of opposite ones."""
+MIN_REACH_MM = 5.0
+"""Nearer targets give no direction."""
+MIN_LATERAL_SHARE = 0.5
+"""Of the distance of a target that lies across the direction away from the seat."""
+FAR_COST = 0.25
+"""For each doubling of the distance beyond the nearest target."""
+MAX_FAR_COST = 1.0
+COMPONENT_COST = 0.1
+"""A component may be displaced itself; a datum feature is the reference."""
+WRONG_COST = 0.6
+"""A component that is out of tolerance."""
+AWAY_COST = 0.6
+""""away from" is followed less surely than "towards", also the farther off."""
+SIDE_COST = 1.8
+"""Sides of the part, where nothing better is there."""
+PAIR_COST = 0.8
+"""Two moves instead of one."""
+OBLIQUE_COST = 0.6
+"""Two directions that are 45° off the right angle."""
+DETOUR_COST = 2.0
+"""For each length of the move that two steps take more than two at a right angle can."""
 
 
 @dataclass(frozen=True)
@@ -95,7 +103,6 @@ def targets_of(part: Part, absent: Sequence[str] = (), wrong: Sequence[str] = ()
         absent: components that are missing from the specimen, which are not named.
         wrong: components that are out of tolerance, which are named last.
     """
-    o = NamingOptions()
     found = []
     for datum in part.datums:
         if datum.feature == "fit":
@@ -105,14 +112,13 @@ def targets_of(part: Part, absent: Sequence[str] = (), wrong: Sequence[str] = ()
     for component in part.model.components:
         if component.name in absent:
             continue
-        cost = o.component_cost + o.wrong_cost * (component.name in wrong)
+        cost = COMPONENT_COST + WRONG_COST * (component.name in wrong)
         found.append(Target(component.name, component.bounds_in_model.mean(axis=0), None, cost))
     return found
 
 
 def lateral_directions(
     part: Part, targets: Sequence[Target], component: str, center: Array, normal: Array, seat: str,
-    options: NamingOptions,
 ) -> list[NamedDirection]:  # fmt: skip
     """Directions across a normal that have a name, seen from a point.
 
@@ -123,44 +129,42 @@ def lateral_directions(
         center: (3,) the point.
         normal: (3,) unit vector away from the seat.
         seat: name of what it stands on, which is no target either.
-        options: of the names.
     """
-    o = options
     bases = {settings.name for settings in part.settings if settings.role == "base"} | {component, seat}
     aims = []
     for target in targets:
-        aim = None if target.name in bases else aim_of(target, center, normal, o)
+        aim = None if target.name in bases else aim_of(target, center, normal)
         if aim is not None:
             aims.append((target, *aim))
     nearest = min((reach for _, _, reach in aims), default=1.0)
     found = []
     for target, direction, reach in aims:
-        cost = target.cost + min(o.max_far_cost, o.far_cost * float(np.log2(reach / nearest)))
+        cost = target.cost + min(MAX_FAR_COST, FAR_COST * float(np.log2(reach / nearest)))
         found.append(NamedDirection(direction, f"towards {target.name}", cost))
-        found.append(NamedDirection(-direction, f"away from {target.name}", 1.5 * cost + o.away_cost))
+        found.append(NamedDirection(-direction, f"away from {target.name}", 1.5 * cost + AWAY_COST))
     up = up_of(part)
     rise = across(up, normal)
     if np.linalg.norm(rise) > 0.5:
         slope = float(np.rad2deg(np.arccos(np.clip(np.linalg.norm(rise), 0.0, 1.0))))
-        words = ("up", "down") if slope < o.max_angle_deg else ("up the slope", "down the slope")
+        words = ("up", "down") if slope < MAX_ANGLE_DEG else ("up the slope", "down the slope")
         rise = rise / np.linalg.norm(rise)
         found += [NamedDirection(rise, words[0]), NamedDirection(-rise, words[1])]
     for side, azimuth_deg in _SIDES:
         direction = across(part.effective_view_range.direction(azimuth_deg, 0.0), normal)
         if np.linalg.norm(direction) > 0.7:
             direction = direction / np.linalg.norm(direction)
-            found.append(NamedDirection(direction, f"towards the {side} of the part", o.side_cost))
+            found.append(NamedDirection(direction, f"towards the {side} of the part", SIDE_COST))
     return found
 
 
-def aim_of(target: Target, center: Array, normal: Array, options: NamingOptions) -> tuple[Array, float] | None:
+def aim_of(target: Target, center: Array, normal: Array) -> tuple[Array, float] | None:
     """Unit vector (3,) across a normal from a point to a target, and its distance, mm; None without a direction."""
     arm = target.point_in_model - center
     if target.normal_in_model is not None:
         arm = target.normal_in_model * (target.normal_in_model @ arm)
     lateral = across(arm, normal)
     reach = float(np.linalg.norm(lateral))
-    if reach < options.min_reach_mm or reach < options.min_lateral_share * float(np.linalg.norm(arm)):
+    if reach < MIN_REACH_MM or reach < MIN_LATERAL_SHARE * float(np.linalg.norm(arm)):
         return None
     return lateral / reach, reach
 
@@ -172,7 +176,6 @@ def across(vector: Array, normal: Array) -> Array:
 
 def in_named_steps(
     vector: Array, declared: Sequence[NamedDirection], found: Sequence[NamedDirection], sideways: float,
-    options: NamingOptions,
 ) -> list[NamedStep]:  # fmt: skip
     """A vector across the seat's normal as one or two steps along directions that have a name.
 
@@ -184,10 +187,9 @@ def in_named_steps(
         declared: directions of the part file, which come first.
         found: all others.
         sideways: what may remain beside the direction of a single step, in the unit of the vector.
-        options: of the names.
     """
     for pool in (declared, [*declared, *found]):
-        steps = _best_steps(vector, pool, sideways, options) if pool else []
+        steps = _best_steps(vector, pool, sideways) if pool else []
         if steps:
             return steps
     length = float(np.linalg.norm(vector))
@@ -197,31 +199,28 @@ def in_named_steps(
     return [NamedStep(NamedDirection(axis, text), axis, length, axis)]
 
 
-def _best_steps(
-    vector: Array, pool: Sequence[NamedDirection], sideways: float, options: NamingOptions
-) -> list[NamedStep]:
-    o = options
+def _best_steps(vector: Array, pool: Sequence[NamedDirection], sideways: float) -> list[NamedStep]:
     length = float(np.linalg.norm(vector))
     axis = vector / length
     best: tuple[float, list[NamedStep]] = (np.inf, [])
     for one in pool:
         angle = np.arccos(np.clip(one.in_model @ axis, -1.0, 1.0))
-        if np.rad2deg(angle) <= o.max_angle_deg and length * np.sin(angle) <= sideways:
-            cost = one.cost + float(np.rad2deg(angle)) / o.max_angle_deg
+        if np.rad2deg(angle) <= MAX_ANGLE_DEG and length * np.sin(angle) <= sideways:
+            cost = one.cost + float(np.rad2deg(angle)) / MAX_ANGLE_DEG
             if cost < best[0]:
                 best = (cost, [NamedStep(one, axis, length, axis)])
     for index, one in enumerate(pool):
         for other in pool[index + 1 :]:
             between = float(np.rad2deg(np.arccos(np.clip(one.in_model @ other.in_model, -1.0, 1.0))))
-            if not o.min_pair_deg <= between <= 180.0 - o.min_pair_deg:
+            if not MIN_PAIR_DEG <= between <= 180.0 - MIN_PAIR_DEG:
                 continue
             rows = np.linalg.pinv(np.stack([one.in_model, other.in_model], axis=1))
             lengths = rows @ vector
             if lengths.min() <= 0.0:
                 continue
             detour = max(0.0, float(lengths.sum()) / length - np.sqrt(2.0))
-            cost = one.cost + other.cost + o.pair_cost + o.oblique_cost * abs(between - 90.0) / 45.0
-            cost += o.detour_cost * detour
+            cost = one.cost + other.cost + PAIR_COST + OBLIQUE_COST * abs(between - 90.0) / 45.0
+            cost += DETOUR_COST * detour
             if cost < best[0]:
                 steps = [
                     NamedStep(which, which.in_model, float(lengths[k]), rows[k]) for k, which in enumerate((one, other))

@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 from arview.cad.check import GUESSED_CAMERA
 from arview.cad.part import Part
 from arview.camera import Camera
-from arview.capture.dome import asked_elevation_deg, component_points, fitting_distance_mm
+from arview.capture.dome import ELEVATION_DEG, asked_elevation_deg, component_points, fitting_distance_mm
 from arview.capture.information import KnownViews, Views, expanded_uncertainty, focal_px
-from arview.capture.options import CaptureOptions
 from arview.errors import InputError
 from arview.geometry import Array, look_at
 from arview.reconstruction.coverage import components_seen, spread_deg, unit
@@ -64,7 +63,7 @@ def photo_plan(part: Part, count: int, camera: Camera | None = None) -> dict[str
 def _ring_angles(part: Part, count: int) -> list[tuple[float, float]]:
     """Azimuth and elevation of each photo: alternately on a lower and an upper ring."""
     view_range = part.effective_view_range
-    low, high = asked_elevation_deg(view_range, CaptureOptions().elevation_deg)
+    low, high = asked_elevation_deg(view_range, ELEVATION_DEG)
     rings = (low + 0.3 * (high - low), low + 0.75 * (high - low))
     start, end = view_range.azimuth_deg
     step = min(end - start, 360.0) / count

@@ -22,7 +22,7 @@ from arview.camera import Camera
 from arview.capture.dome import component_points
 from arview.capture.information import Views, choose_views, focal_px
 from arview.capture.needs import component_weights
-from arview.capture.options import CaptureOptions
+from arview.capture.options import MAX_STEP_DEG
 from arview.errors import ArviewError
 from arview.geometry import Array, rigid
 from arview.measurement.folder import MetricReconstruction, read_folder
@@ -110,7 +110,7 @@ class _Trial:
         start, rest = list(range(START)), list(range(START, self.available))
         order = choose_views(
             views[start], views[rest], component_weights(self._part), directions[rest], list(directions[start]),
-            count - START, CaptureOptions().max_step_deg,
+            count - START, MAX_STEP_DEG,
         )  # fmt: skip
         return sorted([*start, *(rest[index] for index in order)])
 

@@ -17,6 +17,7 @@ from arview.guideviews import GuideViewSet
 from arview.pose import Pose, TrackingState
 from arview.refinement.modalities.edge import smoothed
 from arview.tracking import Tracker, TrackingSession
+from arview.tracking.tracker_options import STAGES
 from arview.video import Image
 from recordings import PHOTO_SEQUENCES
 from rows import ResultRow, watched
@@ -169,7 +170,7 @@ class _PoseSampler:
         }
         for kind, start in starts.items():
             body = start @ part.model_from_body
-            refined = tracker.refiner.refine(image, smooth, body, tracker.options.stages[-2:], appearance)[0]
+            refined = tracker.refiner.refine(image, smooth, body, STAGES[-2:], appearance)[0]
             quality = tracker.refiner.evidence(image, smooth, refined, appearance).quality
             yield self._sampled(kind, refined @ part.body_from_model, truth, quality)
 

@@ -17,6 +17,9 @@ from arview.live.security.refusals import Refusal
 from arview.live.stream.subject import Subject
 from arview.workflow.walk.job import JobFolder, jobs_in
 
+MAX_JOBS = 5000
+"""Of which the folder may hold so many."""
+
 logger = logging.getLogger("arview.live")
 
 KEPT_INSPECTIONS = 64
@@ -78,7 +81,7 @@ class JobBoard:
                 is_of_it = job.serial == serial and job.document["model_hash"] == model
                 if is_of_it and job.components is None and job.state().stage in ("collecting", "measuring"):
                     return job, False
-            if len(jobs) >= self.options.max_jobs:
+            if len(jobs) >= MAX_JOBS:
                 raise Refusal(507, "disk_full", f"the station holds {len(jobs)} inspections; move some")
             self.space.check(0)
             try:

@@ -16,7 +16,6 @@ from arview.live.jobs.subject import is_open
 from arview.live.stream.documents import Document
 from arview.live.stream.phrases import messages_of, texts_of
 from arview.overlay.labels import detail_text, value_text
-from arview.overlay.options import OverlayOptions
 from arview.rework import instruction_document, instructions
 from arview.workflow.walk.job import JobFolder
 from arview.workflow.walk.merged import BeforeAfter, before_after, merged
@@ -83,7 +82,6 @@ def rework(job: JobFolder, desk: JobDesk) -> list[Document]:
 
 def inspection_document(inspection: Inspection) -> Document:
     """What was measured, in the words of the labels."""
-    options = OverlayOptions()
     return {
         "created": inspection.created.isoformat().replace("+00:00", "Z"),
         "verdict": str(overall_verdict(inspection)),
@@ -93,8 +91,8 @@ def inspection_document(inspection: Inspection) -> Document:
             {
                 "name": one.name,
                 "verdict": str(one.verdict),
-                "value_text": value_text(one, options),
-                "detail_text": detail_text(one, options),
+                "value_text": value_text(one),
+                "detail_text": detail_text(one),
                 "distance_mm": one.distance_mm,
                 "uncertainty_mm": one.uncertainty_mm,
             }

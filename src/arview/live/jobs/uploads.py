@@ -33,6 +33,18 @@ from arview.live.security.refusals import Refusal
 from arview.workflow.walk.job import JobFolder
 from arview.workflow.walk.records import PhotoOrigin, checked_hint, checked_time
 
+MAX_PHOTOS = 400
+"""Of one inspection."""
+MAX_OPEN_UPLOADS = 64
+"""Begun and not complete, of one inspection."""
+PHOTO_BYTES = 60_000_000
+"""Size of one photo."""
+PHOTO_PIXELS = 120_000_000
+QUOTA_BYTES = 200_000_000_000
+"""Size of the folder."""
+UPLOAD_DAYS = 7.0
+"""An upload that is not continued for so long is dropped."""
+
 logger = logging.getLogger("arview.live")
 
 MEDIA_TYPES = ("image/jpeg", "image/png", "image/heic", "image/heif")
@@ -94,9 +106,9 @@ class Uploads:
                 return name
             if (known := self._read(wanted.name)) is not None:
                 return known
-            if self._count(wanted.purpose) >= self._options.max_photos:
-                raise Refusal(429, "too_many", f"this inspection has {self._options.max_photos} photos already")
-            if len(self._names()) >= self._options.max_open_uploads:
+            if self._count(wanted.purpose) >= MAX_PHOTOS:
+                raise Refusal(429, "too_many", f"this inspection has {MAX_PHOTOS} photos already")
+            if len(self._names()) >= MAX_OPEN_UPLOADS:
                 raise Refusal(429, "too_many", "too many uploads are not complete", {"Retry-After": "5"})
             self._space.check(wanted.bytes)
             document = {
@@ -151,7 +163,7 @@ class Uploads:
 
     def drop_old(self) -> None:
         """Remove uploads that were not continued for long, and what is left of stored ones."""
-        before = time.time() - 86400.0 * self._options.upload_days
+        before = time.time() - 86400.0 * UPLOAD_DAYS
         with self._lock:
             for name in self._names():
                 upload = self._read(name)
@@ -170,8 +182,8 @@ class Uploads:
             raise Refusal(415, "bad_type", f"expected a photo: {', '.join(MEDIA_TYPES)}")
         if type(size) is not int or size < 1:
             raise Refusal(400, "bad_request", "bytes: expected the size of the photo")
-        if size > self._options.photo_bytes:
-            raise Refusal(413, "too_large", f"the photo has more than {self._options.photo_bytes / 1e6:.0f} MB")
+        if size > PHOTO_BYTES:
+            raise Refusal(413, "too_large", f"the photo has more than {PHOTO_BYTES / 1e6:.0f} MB")
         if not isinstance(sha256, str) or _SHA256.fullmatch(sha256) is None:
             raise Refusal(400, "bad_request", "sha256: expected 64 hexadecimal digits in lower case")
         if source not in get_args(PhotoOrigin):
@@ -255,7 +267,7 @@ class Uploads:
             self._drop(upload.name)
             raise Refusal(422, "bad_hash", "the photo arrived damaged; send it again")
         try:
-            check_photo(content, self._options.photo_pixels)
+            check_photo(content, PHOTO_PIXELS)
         except InputError as error:
             self._drop(upload.name)
             raise Refusal(422, "bad_photo", str(error)) from error
@@ -303,7 +315,7 @@ class PhotoSpace:
         with self._lock:
             if time.monotonic() - self._measured_s > self.REFRESH_S:
                 self._used, self._measured_s = folder_bytes(options.folder), time.monotonic()
-            if self._used + size > options.quota_bytes:
+            if self._used + size > QUOTA_BYTES:
                 raise Refusal(507, "disk_full", "the inspections fill their quota at the station; move some")
             if free_bytes(options.folder) - size < options.min_free_bytes:
                 raise Refusal(507, "disk_full", "the disk of the station is almost full; free some space")

@@ -26,6 +26,17 @@ from arview.live.options import JobOptions
 from arview.workflow.walk.job import JobFolder, start_worker
 from arview.workflow.walk.records import WalkState
 
+WORKER_PAUSES_S: tuple[float, ...] = (2.0, 10.0, 60.0)
+"""Before a measurement that broke is started again."""
+WORKER_STOP_S = 2.5
+"""Time for a measurement to end in good order."""
+PATIENCE_S = 30.0
+"""A measurement that only waits for photos makes room for others after so long."""
+IDLE_S = 900.0
+"""And ends after so long, until a photo comes."""
+RECENT_S = 86400.0
+"""A walk of an earlier run that was not ended is continued if it is younger."""
+
 logger = logging.getLogger("arview.live")
 
 WorkerState = Literal["none", "waiting", "running", "failed"]
@@ -78,7 +89,7 @@ class WorkerQueue:
 
     def resume(self, jobs: list[JobFolder]) -> None:
         """Continue with jobs of an earlier run: those that are not finished, and workers that still run."""
-        now_s, recent = time.monotonic(), time.time() - self._options.recent_s
+        now_s, recent = time.monotonic(), time.time() - RECENT_S
         with self._lock:
             for job in jobs:
                 pid = running_worker(job)
@@ -101,7 +112,7 @@ class WorkerQueue:
                 return "none"
             if entry.is_running:
                 return "running"
-            return "failed" if entry.breaks > len(self._options.worker_pauses_s) else "waiting"
+            return "failed" if entry.breaks > len(WORKER_PAUSES_S) else "waiting"
 
     def tick(self) -> None:
         """Notice which workers have ended, make room, start others. To be called about twice a second, in a thread."""
@@ -127,7 +138,7 @@ class WorkerQueue:
                 _signal(entry, signal.SIGTERM)
 
         def wait() -> None:
-            ends_s = time.monotonic() + self._options.worker_stop_s
+            ends_s = time.monotonic() + WORKER_STOP_S
             while time.monotonic() < ends_s and any(map(_is_alive, running)):
                 time.sleep(0.02)
             for entry in running:
@@ -142,7 +153,7 @@ class WorkerQueue:
         return wait
 
     def _may_start(self, entry: _Entry) -> bool:
-        if entry.breaks > len(self._options.worker_pauses_s) or time.monotonic() < entry.retry_s:
+        if entry.breaks > len(WORKER_PAUSES_S) or time.monotonic() < entry.retry_s:
             return False
         return entry.asked_s > entry.served_s or _is_only_cloud(entry)
 
@@ -157,9 +168,9 @@ class WorkerQueue:
             state = entry.job.state()
             quiet_s = now_s - max(entry.asked_s, entry.started_s)
             is_idle = state.stage == "collecting" and not entry.job.is_ended
-            is_patient = is_idle and quiet_s > self._options.patience_s
+            is_patient = is_idle and quiet_s > PATIENCE_S
             makes_room = (others_measure and _is_only_cloud(entry)) or (others_wait and is_patient)
-            if not entry.stopping and (makes_room or (is_idle and quiet_s > self._options.idle_s)):
+            if not entry.stopping and (makes_room or (is_idle and quiet_s > IDLE_S)):
                 logger.info("the measurement of %s is set aside", entry.job.id)
                 entry.stopping = True
                 if is_idle:
@@ -199,7 +210,7 @@ class WorkerQueue:
             self._broke(entry)
 
     def _broke(self, entry: _Entry) -> None:
-        pauses_s = self._options.worker_pauses_s
+        pauses_s = WORKER_PAUSES_S
         if entry.breaks < len(pauses_s):
             entry.retry_s = time.monotonic() + pauses_s[entry.breaks]
         entry.breaks += 1

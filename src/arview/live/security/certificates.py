@@ -29,14 +29,13 @@ _AUTHORITY, _AUTHORITY_KEY = "authority.pem", "authority.key"
 _LEAF, _LEAF_KEY = "server.pem", "server.key"
 
 
-@dataclass(frozen=True)
-class CertificateOptions:
-    """Lifetimes of the certificates."""
-
-    authority_days: int = 3650
-    authority_renewal_days: int = 120  # the authority is replaced when fewer days are left
-    server_days: int = 90  # Apple refuses server certificates that are valid for more than 825 days
-    server_renewal_days: int = 30  # the server certificate is renewed when fewer days are left
+AUTHORITY_DAYS = 3650
+AUTHORITY_RENEWAL_DAYS = 120
+"""The authority is replaced when fewer days are left."""
+SERVER_DAYS = 90
+"""Apple refuses server certificates that are valid for more than 825 days."""
+SERVER_RENEWAL_DAYS = 30
+"""The server certificate is renewed when fewer days are left."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +84,6 @@ def local_certificates(
     addresses: Collection[str],
     folder: Path | None = None,
     now: datetime | None = None,
-    options: CertificateOptions | None = None,
 ) -> Certificates:
     """Certificates for a server at these addresses, created or renewed where needed.
 
@@ -93,7 +91,6 @@ def local_certificates(
         addresses: IP addresses and names at which the server is reached.
         folder: where they are stored, readable by this user only; default `data_folder` / ``tls``.
         now: time at which their age is computed; default: the present.
-        options: lifetimes.
 
     Raises:
         OutputError: the folder is not writable.
@@ -101,7 +98,6 @@ def local_certificates(
     """
     folder = folder or data_folder() / "tls"
     now = now or datetime.now(UTC)
-    options = options or CertificateOptions()
     public = sorted(address for address in addresses if not _is_permitted(address))
     if public:
         raise InputError(
@@ -112,14 +108,14 @@ def local_certificates(
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)
         folder.chmod(0o700)
         authority = _load(folder / _AUTHORITY, folder / _AUTHORITY_KEY)
-        is_new = authority is None or _days_left(authority[0], now) < options.authority_renewal_days
+        is_new = authority is None or _days_left(authority[0], now) < AUTHORITY_RENEWAL_DAYS
         if authority is None or is_new:
-            authority = _make_authority(now, options.authority_days)
+            authority = _make_authority(now, AUTHORITY_DAYS)
             _save(folder / _AUTHORITY, folder / _AUTHORITY_KEY, [authority[0]], authority[1])
         leaf = _load(folder / _LEAF, folder / _LEAF_KEY)
-        is_good = leaf is not None and _is_good(leaf[0], authority[0], addresses, now, options.server_renewal_days)
+        is_good = leaf is not None and _is_good(leaf[0], authority[0], addresses, now, SERVER_RENEWAL_DAYS)
         if leaf is None or not is_good:
-            leaf = _make_leaf(authority, addresses, now, options.server_days)
+            leaf = _make_leaf(authority, addresses, now, SERVER_DAYS)
             _save(folder / _LEAF, folder / _LEAF_KEY, [leaf[0], authority[0]], leaf[1])
     except OSError as error:
         raise OutputError(f"{folder}: cannot store the certificates there ({error.strerror or error})") from error

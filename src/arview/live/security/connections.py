@@ -4,9 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from arview.live.options import ConnectionLimits
 from arview.live.security.limits import RateLimit
 from arview.live.security.refusals import Refusal
+
+STRANGERS_OF_ADDRESS = 64
+"""Connections of one address that have not shown the token; an idle one is 0.3 MB."""
+MAX_STRANGERS = 256
+"""Of all addresses."""
+MAX_GUESTS = 256
+"""Connections that have shown the token."""
+HANDSHAKES_PER_S = 30.0
+"""New connections of one address: about a tenth of a core at most."""
+HANDSHAKES_BURST = 300.0
 
 Peer = tuple[str, int]
 """Address and port of the other end of a connection."""
@@ -19,14 +28,10 @@ class ConnectionTable:
     others. A stranger too many makes room by closing the oldest one of its address, or of the address that has the
     most: an address that holds many idle connections thus stops neither others nor itself, and phones that share one
     address behind a router can still join.
-
-    Args:
-        limits: bounds on the connections.
     """
 
-    def __init__(self, limits: ConnectionLimits | None = None) -> None:
-        self._limits = limits or ConnectionLimits()
-        self._rate = RateLimit(self._limits.handshakes_per_s, self._limits.handshakes_burst)
+    def __init__(self) -> None:
+        self._rate = RateLimit(HANDSHAKES_PER_S, HANDSHAKES_BURST)
         self._guests: dict[Peer, Callable[[], None]] = {}
         self._strangers: dict[str, dict[Peer, Callable[[], None]]] = {}
 
@@ -40,9 +45,9 @@ class ConnectionTable:
         address = peer[0]
         if self._rate.take(address) > 0.0:
             return False
-        if len(self._strangers.get(address, ())) >= self._limits.strangers_of_address:
+        if len(self._strangers.get(address, ())) >= STRANGERS_OF_ADDRESS:
             self._close_oldest(address)
-        elif self.strangers >= self._limits.max_strangers:
+        elif self.strangers >= MAX_STRANGERS:
             self._close_oldest(max(self._strangers, key=lambda one: len(self._strangers[one])))
         self._strangers.setdefault(address, {})[peer] = close
         return True
@@ -56,7 +61,7 @@ class ConnectionTable:
         close = self._strangers.get(peer[0], {}).get(peer)
         if close is None:  # noted before, or closed meanwhile
             return
-        if len(self._guests) >= self._limits.max_guests:
+        if len(self._guests) >= MAX_GUESTS:
             raise Refusal(503, "busy", "busy: too many connections", {"Retry-After": "5", "Connection": "close"})
         self.remove(peer)
         self._guests[peer] = close

@@ -46,13 +46,12 @@ _BROWSERS = (
 """Words in the header ``User-Agent``, the more special ones first, and what devices are called for them."""
 
 
-@dataclass(frozen=True)
-class DeviceOptions:
-    """How many devices stay paired, and for how long."""
-
-    max_devices: int = 64  # one more takes the place of the one that was not used for the longest time
-    unused_days: float = 180.0  # a device that is not used for so long is forgotten
-    save_interval_s: float = 600.0  # times of last use are written at most so often
+MAX_DEVICES = 64
+"""One more takes the place of the one that was not used for the longest time."""
+UNUSED_DAYS = 180.0
+"""A device that is not used for so long is forgotten."""
+SAVE_INTERVAL_S = 600.0
+"""Times of last use are written at most so often."""
 
 
 @dataclass(frozen=True)
@@ -76,11 +75,10 @@ class Devices:
 
     Args:
         path: of their file, readable by this user only; None: they are forgotten at the end of the run.
-        options: bounds on their number and age.
     """
 
-    def __init__(self, path: Path | None = None, options: DeviceOptions | None = None) -> None:
-        self._path, self._options = path, options or DeviceOptions()
+    def __init__(self, path: Path | None = None) -> None:
+        self._path = path
         self._lock = threading.RLock()
         self._devices: dict[str, PairedDevice] = {}
         self._read_state: tuple[int, int, int] | None = None
@@ -95,7 +93,7 @@ class Devices:
             base = device_name(user_agent)
             names = (base if count == 1 else f"{base} {count}" for count in range(1, len(taken) + 2))
             name = next(one for one in names if one not in taken)
-            while len(self._devices) >= self._options.max_devices:
+            while len(self._devices) >= MAX_DEVICES:
                 oldest = min(self._devices.values(), key=lambda device: device.last_used)
                 logger.warning("%s is no longer paired: there are too many devices", oldest.name)
                 del self._devices[oldest.token_hash]
@@ -141,7 +139,7 @@ class Devices:
                 return
             if self._state() != self._read_state:
                 self._read()
-            is_due = datetime.now(UTC) - self._saved > timedelta(seconds=self._options.save_interval_s)
+            is_due = datetime.now(UTC) - self._saved > timedelta(seconds=SAVE_INTERVAL_S)
         if is_due:
             self.save()
 
@@ -167,7 +165,7 @@ class Devices:
                 self._write()
 
     def _forget_unused(self) -> None:
-        before = datetime.now(UTC) - timedelta(days=self._options.unused_days)
+        before = datetime.now(UTC) - timedelta(days=UNUSED_DAYS)
         self._devices = {key: device for key, device in self._devices.items() if device.last_used >= before}
 
     def _read(self) -> None:

@@ -28,13 +28,25 @@ from arview.live.security.refusals import Refusal
 from arview.live.server.annotated_png import annotated_png
 from arview.live.server.clients import Client
 from arview.live.server.hub import Hub
-from arview.live.server.jobs_api import JobHandlers
+from arview.live.server.jobs_api import BODY_TIMEOUT_S, JobHandlers
 from arview.live.server.station_api import StationHandlers, keep_snapshot
 from arview.live.server.workers import StuckError
 from arview.live.stream.documents import Document
 from arview.live.stream.feed import TrackedFrame
 from arview.live.stream.frames import DecodedFrame, IncomingFrame, from_jpeg
 from arview.live.transport.motion_jpeg import MotionJpeg
+
+JPEG_BYTES = 4_000_000
+"""Size of an uploaded frame."""
+OFFER_BYTES = 64_000
+"""Size of a join request with its WebRTC offer."""
+CONTROL_BYTES = 4_000
+WATCHERS = 4
+"""Screens that only watch, as motion JPEG."""
+TRACKING_TIMEOUT_S = 10.0
+"""Time in which an uploaded frame must be tracked."""
+FRAME_WAIT_S = 5.0
+"""Time that a request for a station's next frame waits."""
 
 logger = logging.getLogger("arview.live")
 
@@ -101,10 +113,10 @@ class Handlers:
     async def watch_mjpg(self, request: Request) -> Response:
         """Motion JPEG of the annotated frames."""
         self._hub.ready()
-        if self._hub.watchers >= self._hub.options.watchers:
+        if self._hub.watchers >= WATCHERS:
             raise Refusal(503, "busy", f"busy: {self._hub.watchers} screens are watching")
         device = request.scope.get(DEVICE)
-        return MotionJpeg(self._hub, self._hub.options, lambda: self._hub.is_paired(device))
+        return MotionJpeg(self._hub, lambda: self._hub.is_paired(device))
 
     async def part(self, request: Request) -> Response:
         """The *Part* document, for a client that of its job."""
@@ -131,7 +143,7 @@ class Handlers:
     async def join(self, request: Request) -> Response:
         """Add a client."""
         self._joins.check(request.client.host if request.client else "?")
-        wanted = await self._json_body(request, self._hub.options.requests.offer_bytes)
+        wanted = await self._json_body(request, OFFER_BYTES)
         client, answer = await self._hub.join(wanted, request.scope.get(DEVICE))
         described = None if answer is None else {"type": "answer", "sdp": answer}
         return _json_response({"client": client.name, "answer": described}, 201)
@@ -145,7 +157,7 @@ class Handlers:
     async def control(self, request: Request) -> Response:
         """Carry out a *Control* request and return the *Status*."""
         client = self._client(request)
-        await self._hub.control(client, await self._json_body(request, self._hub.options.requests.control_bytes))
+        await self._hub.control(client, await self._json_body(request, CONTROL_BYTES))
         return _json_response(self._hub.status(client))
 
     async def take_frame(self, request: Request) -> Response:
@@ -160,8 +172,7 @@ class Handlers:
             frame_id, turns = _number(request, "id", FRAME_IDS), _number(request, "turns", 4, 0)
             if request.headers.get("content-type", "").split(";")[0].strip().lower() != "image/jpeg":
                 raise Refusal(415, "bad_type", "expected image/jpeg")
-            limits = self._hub.options.requests
-            content = await body(request, limits.jpeg_bytes, limits.body_timeout_s)
+            content = await body(request, JPEG_BYTES, BODY_TIMEOUT_S)
             arrived_s = time.monotonic()
             try:
                 image = await asyncio.to_thread(from_jpeg, content)
@@ -187,7 +198,7 @@ class Handlers:
         after = _number(request, "after", FRAME_IDS, -1)
         client.is_busy = True
         try:
-            async with asyncio.timeout(self._hub.options.frame_wait_s):
+            async with asyncio.timeout(FRAME_WAIT_S):
                 tracked = client.feed.newest
                 while tracked is None or tracked.frame.frame_id == after:
                     tracked = await client.inbox.take()
@@ -226,7 +237,7 @@ class Handlers:
     async def _tracked(self, client: Client, frame: DecodedFrame) -> TrackedFrame:
         """Wait until this frame has been tracked."""
         try:
-            async with asyncio.timeout(self._hub.options.tracking_timeout_s):
+            async with asyncio.timeout(TRACKING_TIMEOUT_S):
                 while (tracked := await client.inbox.take()).frame is not frame:
                     pass
                 return tracked
@@ -234,7 +245,7 @@ class Handlers:
             raise Refusal(503, "busy", "the tracking took too long; send the next picture") from error
 
     async def _json_body(self, request: Request, max_bytes: int) -> dict[str, Any]:
-        return await json_body(request, max_bytes, self._hub.options.requests.body_timeout_s)
+        return await json_body(request, max_bytes, BODY_TIMEOUT_S)
 
     def _client(self, request: Request) -> Client:
         return self._hub.client(request.path_params["client"])

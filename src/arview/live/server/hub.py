@@ -38,6 +38,21 @@ from arview.live.stream.station import StationCamera
 from arview.live.stream.subjects import Subjects
 from arview.live.transport.webrtc import Connection
 
+OFFER_TIMEOUT_S = 10.0
+"""Time to answer an offer."""
+CONNECT_TIMEOUT_S = 20.0
+"""Time from the offer to a connection."""
+JPEG_SILENCE_S = 15.0
+"""A page without WebRTC that sends no request for so long is removed."""
+TICK_S = 0.25
+"""Interval of the regular work: clients that are gone, changed inspections, status messages."""
+STATUS_INTERVAL_S = 1.0
+"""A status is sent at least this often."""
+RELOAD_INTERVAL_S = 1.0
+"""Time between two checks of the inspection file."""
+CLOSING_TIMEOUT_S = 1.2
+"""At the end, time for each of pages, camera and tracking to close."""
+
 logger = logging.getLogger("arview.live")
 
 
@@ -86,7 +101,7 @@ class Hub:
         if not self.options.is_phone:
             feed, annotator = Feed(subjects, "station"), FrameAnnotator(subjects)
             self._shared = feed, annotator
-            self._station = StationCamera(self.options.source, feed, self.options.station)
+            self._station = StationCamera(self.options.source, feed)
             if self.options.record is not None:
                 self.recordings.start(feed, annotator, self.options.record)
         self._ticker = asyncio.ensure_future(self._run_ticker())
@@ -325,14 +340,14 @@ class Hub:
                     await task
         # The files come first; what does not close in time is left to the end of the program.
         if self.recordings is not None:
-            await self._within(in_daemon_thread(self.recordings.stop_all), 2.0 * self.options.closing_timeout_s)
+            await self._within(in_daemon_thread(self.recordings.stop_all), 2.0 * CLOSING_TIMEOUT_S)
         closing: list[Awaitable[object]] = [self.leave(name) for name in list(self.clients)]
         if self._station is not None:
             closing.append(in_daemon_thread(self._station.close))
         if self._shared is not None:
             closing.append(in_daemon_thread(self._shared[0].close))
-        await self._within(asyncio.gather(*closing, return_exceptions=True), self.options.closing_timeout_s)
-        await self._within(finishing, self.options.closing_timeout_s)
+        await self._within(asyncio.gather(*closing, return_exceptions=True), CLOSING_TIMEOUT_S)
+        await self._within(finishing, CLOSING_TIMEOUT_S)
 
     async def _within(self, work: Awaitable[object], timeout_s: float) -> None:
         """Wait for work, but not for long."""
@@ -349,10 +364,10 @@ class Hub:
             self._leaving.add(leaving)
             leaving.add_done_callback(self._leaving.discard)
 
-        connection = Connection(client.feed, client, self._addresses, ended, self.options.webrtc)
+        connection = Connection(client.feed, client, self._addresses, ended)
         client.connection = connection
         try:
-            return await asyncio.wait_for(connection.answer(sdp), self.options.webrtc.offer_timeout_s)
+            return await asyncio.wait_for(connection.answer(sdp), OFFER_TIMEOUT_S)
         except (InputError, TimeoutError) as error:
             await self._release(client)
             raise Refusal(400, "bad_offer", str(error) or "the offer could not be answered in time") from error
@@ -395,10 +410,10 @@ class Hub:
     async def _run_ticker(self) -> None:
         reloaded_s = 0.0
         while True:
-            await asyncio.sleep(self.options.tick_s)
+            await asyncio.sleep(TICK_S)
             try:
                 now_s = time.monotonic()
-                if now_s - reloaded_s >= self.options.reload_interval_s and self.subjects is not None:
+                if now_s - reloaded_s >= RELOAD_INTERVAL_S and self.subjects is not None:
                     reloaded_s = now_s
                     await asyncio.to_thread(self._look_up, self.subjects)
                     await self._remove_unpaired()
@@ -448,8 +463,8 @@ class Hub:
 
     def _is_gone(self, client: Client, now_s: float) -> bool:
         if client.connection is None:
-            return not client.is_busy and now_s - client.seen_s > self.options.jpeg_silence_s
-        return not client.connection.is_connected and now_s - client.joined_s > self.options.webrtc.connect_timeout_s
+            return not client.is_busy and now_s - client.seen_s > JPEG_SILENCE_S
+        return not client.connection.is_connected and now_s - client.joined_s > CONNECT_TIMEOUT_S
 
     def _send_status(self, client: Client, now_s: float) -> None:
         """Send a page its status when it has changed, or when the last one is older than the interval."""
@@ -463,6 +478,6 @@ class Hub:
             status["recording"]["finished"],
             status["job"],
         )
-        if news != client.last_status[0] or now_s - client.last_status[1] >= self.options.status_interval_s:
+        if news != client.last_status[0] or now_s - client.last_status[1] >= STATUS_INTERVAL_S:
             client.last_status = news, now_s
             client.connection.send(status)

@@ -39,6 +39,15 @@ from arview.rework import drawing_svg
 from arview.workflow.walk.job import JobFolder
 from arview.workflow.walk.records import PhotoOrigin
 
+BODY_TIMEOUT_S = 10.0
+"""Time in which a body must arrive."""
+PIECE_BYTES = 1 << 20
+"""Body of one request of an upload."""
+PIECE_TIMEOUT_S = 60.0
+"""Time in which it must arrive; a slow network is no reason to start again."""
+TEXT_BYTES = 16_000
+"""Bodies of the other requests: hints, decisions."""
+
 T = TypeVar("T")
 
 REPORT_POLICY = "sandbox allow-scripts allow-popups allow-downloads allow-modals; frame-ancestors 'self'"
@@ -182,8 +191,7 @@ class JobHandlers:
         text = request.query_params.get("offset", "")
         if not (text.isascii() and text.isdecimal() and len(text) < 12):
             raise Refusal(400, "bad_request", "offset: expected a number of bytes")
-        options = self._desk.board.options
-        piece = await body(request, options.piece_bytes, options.piece_timeout_s)
+        piece = await body(request, PIECE_BYTES, PIECE_TIMEOUT_S)
         uploads = self._desk.board.uploads(job)
         name = request.path_params["upload"]
         before = await asyncio.to_thread(uploads.state, name)
@@ -355,7 +363,7 @@ class JobHandlers:
 
     async def _json(self, request: Request) -> dict[str, Any]:
         return await json_body(
-            request, self._desk.board.options.text_bytes, self._hub.options.requests.body_timeout_s
+            request, TEXT_BYTES, BODY_TIMEOUT_S
         )  # fmt: skip
 
 

@@ -29,6 +29,13 @@ from arview.live.server.workers import WorkerPool, in_daemon_thread
 from arview.live.stream.subjects import Subjects
 from arview.live.transport.webrtc import raise_bitrates
 
+RENEWAL_INTERVAL_S = 12 * 3600.0
+"""Time between two checks of the age of the certificate."""
+WORKER_TIMEOUT_S = 30.0
+"""A thread for drawing, JPEG or files that takes longer is given up and replaced."""
+WORKERS = 16
+"""Threads for drawing, JPEG and files; most of them wait for a renderer."""
+
 logger = logging.getLogger("arview.live")
 
 
@@ -141,11 +148,11 @@ class LiveServer:
         self._loop, self._stop = asyncio.get_running_loop(), asyncio.Event()
         if self._is_stopped:
             self._stop.set()
-        self._loop.set_default_executor(WorkerPool(self.options.workers, self.options.worker_timeout_s))
+        self._loop.set_default_executor(WorkerPool(WORKERS, WORKER_TIMEOUT_S))
         raise_bitrates()
         addresses = [address for address in self.endpoint.addresses if address != "localhost"]
         hub = Hub(self.options, addresses, self.access.devices)
-        connections, place = ConnectionTable(self.options.connections), self.endpoint
+        connections, place = ConnectionTable(), self.endpoint
         app = make_app(hub, self.access, connections)
         servers = [UvicornServer(app, place.listener, place.certificates, connections)]
         if self.endpoint.trust_listener is not None and self.endpoint.certificates is not None:
@@ -177,7 +184,7 @@ class LiveServer:
     async def _renew(self, server: UvicornServer) -> None:
         """Renew the certificate of a server that runs for months."""
         while True:
-            await asyncio.sleep(self.options.renewal_interval_s)
+            await asyncio.sleep(RENEWAL_INTERVAL_S)
             if self.endpoint.trust_listener is None:
                 continue
             try:

@@ -11,9 +11,20 @@ import uvicorn
 from starlette.types import ASGIApp
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from arview.live.options import ConnectionLimits
 from arview.live.security.certificates import Certificates
 from arview.live.security.connections import ConnectionTable, Peer
+
+HANDSHAKE_TIMEOUT_S = 5.0
+"""Time for the TLS handshake."""
+CLOSING_TIMEOUT_S = 2.0
+"""Time for the other end to answer the end of a TLS connection."""
+HEADERS_TIMEOUT_S = 10.0
+"""Time to send a whole request; later the connection is closed (Slowloris)."""
+WRITE_TIMEOUT_S = 20.0
+"""A client that accepts no data for so long is disconnected."""
+KEEP_ALIVE_S = 20
+"""Time between two requests of a connection."""
+MAX_HEADER_BYTES = 16_384
 
 
 class TimeLimitedProtocol(H11Protocol):
@@ -39,7 +50,7 @@ class TimeLimitedProtocol(H11Protocol):
         """Start to wait for the next request."""
         super().on_response_complete()
         if not self.transport.is_closing():
-            self._await_headers(self.limits.keep_alive_s + self.limits.headers_timeout_s)
+            self._await_headers(KEEP_ALIVE_S + HEADERS_TIMEOUT_S)
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Cancel the timers."""
@@ -53,7 +64,7 @@ class TimeLimitedProtocol(H11Protocol):
     def pause_writing(self) -> None:
         """Start to wait for the client to read the response."""
         super().pause_writing()
-        self._write_timer = self.loop.call_later(self.limits.write_timeout_s, self.transport.abort)
+        self._write_timer = self.loop.call_later(WRITE_TIMEOUT_S, self.transport.abort)
 
     def resume_writing(self) -> None:
         """Stop to wait: the client has read."""
@@ -65,7 +76,7 @@ class TimeLimitedProtocol(H11Protocol):
     _write_timer: asyncio.TimerHandle | None = None
 
     def _await_headers(self, timeout_s: float | None = None) -> None:
-        timeout_s = self.limits.headers_timeout_s if timeout_s is None else timeout_s
+        timeout_s = HEADERS_TIMEOUT_S if timeout_s is None else timeout_s
         if self._headers_timer is not None:
             self._headers_timer.cancel()
         self._headers_timer = self.loop.call_later(timeout_s, self.transport.close)
@@ -104,9 +115,9 @@ class UvicornServer(uvicorn.Server):
                 access_log=False,
                 server_header=False,
                 proxy_headers=False,
-                timeout_keep_alive=TimeLimitedProtocol.limits.keep_alive_s,
+                timeout_keep_alive=KEEP_ALIVE_S,
                 timeout_graceful_shutdown=1,
-                h11_max_incomplete_event_size=TimeLimitedProtocol.limits.max_header_bytes,
+                h11_max_incomplete_event_size=MAX_HEADER_BYTES,
                 ssl_certfile=str(certificates.chain) if certificates else None,
                 ssl_keyfile=str(certificates.key) if certificates else None,
             )
@@ -188,8 +199,8 @@ class UvicornServer(uvicorn.Server):
                 lambda: protocol,
                 line,
                 ssl=tls,
-                ssl_handshake_timeout=limits.handshake_timeout_s if tls else None,
-                ssl_shutdown_timeout=limits.closing_timeout_s if tls else None,
+                ssl_handshake_timeout=HANDSHAKE_TIMEOUT_S if tls else None,
+                ssl_shutdown_timeout=CLOSING_TIMEOUT_S if tls else None,
             )
         except OSError:  # the handshake failed or took too long; ssl.SSLError is an OSError
             self._connections.remove(peer)

@@ -17,6 +17,11 @@ from arview.live.stream.subject import OverlayStyle
 from arview.live.stream.subjects import FrameOverlay, Subjects
 from arview.video import Image
 
+DRAW_TIMEOUT_S = 10.0
+"""A picture that is drawn for longer is given up, and others are drawn without it."""
+KEPT_STYLES = 6
+"""Overlay styles that keep a renderer and their last picture: pages, recording and screens."""
+
 
 @dataclass(frozen=True)
 class Screen:
@@ -118,7 +123,7 @@ class FrameAnnotator:
         """
         wanted = style or self.style, screen
         lock, renderers = self._lock, self._renderers
-        if not lock.acquire(timeout=self._subjects.options.feed.draw_timeout_s):
+        if not lock.acquire(timeout=DRAW_TIMEOUT_S):
             # The thread that draws does not come back: it keeps its renderers, and others get new ones.
             if lock is self._lock:
                 self._lock, self._renderers = threading.Lock(), OrderedDict()
@@ -126,7 +131,7 @@ class FrameAnnotator:
         try:
             renderer = renderers.pop(wanted, None) or _StyleRenderer(self._subjects, *wanted)
             renderers[wanted] = renderer
-            if len(renderers) > self._subjects.options.feed.kept_styles:
+            if len(renderers) > KEPT_STYLES:
                 renderers.popitem(last=False)
             return renderer.draw(tracked)
         finally:

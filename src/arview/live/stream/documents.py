@@ -258,7 +258,6 @@ def _deviation_document(found: ComponentDeviation | None, is_pending: bool = Fal
         value = MEASURING if is_pending else ""
         empty = {"displacement_mm": None, "missing": False, "value_text": value, "detail_text": ""}
         return {**dict.fromkeys(names), **empty, "is_pending": is_pending}
-    plain = OverlayOptions()
     return {
         "verdict": str(found.verdict),
         "verdict_text": VERDICT_WORD[found.verdict],
@@ -268,8 +267,8 @@ def _deviation_document(found: ComponentDeviation | None, is_pending: bool = Fal
         "tolerance_mm": found.tolerance_mm,
         "displacement_mm": list(found.displacement_mm),
         "missing": found.finding is Finding.MISSING,
-        "value_text": value_text(found, plain),
-        "detail_text": detail_text(found, plain),
+        "value_text": value_text(found),
+        "detail_text": detail_text(found),
         "is_pending": False,
     }
 

@@ -16,6 +16,7 @@ from arview.camera import Camera
 from arview.camera.read import guess_camera
 from arview.camera.undistort import FrameView, require_brown
 from arview.errors import ArviewError
+from arview.live.options import UNDISTORT
 from arview.live.stream.frames import DecodedFrame, IncomingFrame, to_jpeg
 from arview.live.stream.newest import NewestSlot
 from arview.live.stream.notices import Notice, without_folder
@@ -23,6 +24,21 @@ from arview.live.stream.sessions import FeedSession
 from arview.live.stream.subjects import Subjects
 from arview.pose import Pose, TrackingState
 from arview.tracking.self_calibration.profile import keep_profile
+
+STUCK_S = 90.0
+"""A frame that is tracked for longer is given up with its thread; compiling takes a minute."""
+MAX_LOST = 4
+"""Threads given up; then the stream ends, with a notice."""
+KEPT_FRAMES = 12
+"""Tracked frames kept for snapshots while the network is slow; 33 MB at 720p."""
+RATE_WINDOW_S = 2.0
+"""Window over which frame rates are counted."""
+SILENCE_S = 1.5
+"""A feed without a frame for longer than this is waiting."""
+MAX_UNREADABLE = 15
+"""Consecutive frames without a readable stamp, half a second, that raise a notice."""
+MIN_SCALE = 0.95
+"""A frame received at less than this share of its size raises a notice."""
 
 logger = logging.getLogger("arview.live")
 
@@ -94,13 +110,12 @@ class Feed:
         self.kind = kind
         self.received = self.unreadable = self.failures = 0
         self.newest: TrackedFrame | None = None
-        self.options = subjects.options.feed
-        self.received_rate = _EventRate(self.options.rate_window_s)
-        self.tracked_rate = _EventRate(self.options.rate_window_s)
+        self.received_rate = _EventRate(RATE_WINDOW_S)
+        self.tracked_rate = _EventRate(RATE_WINDOW_S)
         self._subjects = subjects
         self._slot: NewestSlot[IncomingFrame] = NewestSlot()
         self._listeners: list[Callable[[TrackedFrame], None]] = []
-        self._kept: deque[TrackedFrame] = deque(maxlen=self.options.kept_frames)
+        self._kept: deque[TrackedFrame] = deque(maxlen=KEPT_FRAMES)
         self._arrived_s: float | None = None
         self._session: FeedSession | None = None
         self._view: FrameView | None = None
@@ -154,16 +169,16 @@ class Feed:
     def replace_if_stuck(self) -> None:
         """Give the stream another thread when decoding or tracking of a frame does not come back."""
         began_s = self._step_began_s
-        if began_s is None or time.monotonic() - began_s < self.options.stuck_s or self._slot.is_closed:
+        if began_s is None or time.monotonic() - began_s < STUCK_S or self._slot.is_closed:
             return
         self._step_began_s = None
         self._lost += 1
         self.failures += 1
-        if self._lost > self.options.max_lost:
+        if self._lost > MAX_LOST:
             logger.error("the tracking did not come back %d times; the stream has ended", self._lost)
             self._slot.close()
             return
-        logger.warning("the tracking of a frame did not come back within %.0f s and is replaced", self.options.stuck_s)
+        logger.warning("the tracking of a frame did not come back within %.0f s and is replaced", STUCK_S)
         self._shape = self._session = None
         self._start()
 
@@ -183,7 +198,7 @@ class Feed:
         age_ms = self.age_ms
         if age_ms is None:
             return "waiting", "waiting for the first picture"
-        if age_ms > 1e3 * self.options.silence_s:
+        if age_ms > 1e3 * SILENCE_S:
             return "waiting", f"no picture for {age_ms / 1e3:.0f} s"
         return "live", ""
 
@@ -194,11 +209,11 @@ class Feed:
         if estimate is not None and estimate.is_determined:
             notices.append(Notice("camera_estimated", "info", estimate.text))
         newest = self.newest
-        if newest is not None and newest.frame.scale < self.options.min_scale:
+        if newest is not None and newest.frame.scale < MIN_SCALE:
             notices.append(
                 Notice("frames_scaled", "warning", f"pictures arrive at {newest.frame.scale:.0%} of their size")
             )
-        if self._unreadable_in_a_row >= self.options.max_unreadable:
+        if self._unreadable_in_a_row >= MAX_UNREADABLE:
             notices.append(
                 Notice("stamp_unreadable", "error", "pictures arrive damaged: their frame counter cannot be read")
             )
@@ -317,7 +332,7 @@ class Feed:
             camera = self._subjects.camera(width, height, turns, unsquared_size)
             if self.kind == "phone":  # whose page shows the picture of the phone as it is
                 camera = require_brown(camera, "pictures of a phone")
-            self._view = FrameView(camera, self.options.undistort)
+            self._view = FrameView(camera, UNDISTORT)
             self._camera = self._view.tracked_camera
             self._session = self._subjects.session(self._camera)
         except ArviewError as error:

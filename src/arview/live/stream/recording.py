@@ -27,6 +27,16 @@ from arview.pose_file import PoseWriter
 from arview.video import Image, VideoSink
 from arview.video.sinks import CONTAINERS
 
+MIN_FREE_BYTES = 500_000_000
+"""Free disk space that is left to other programs."""
+LOW_BYTES = 2_000_000_000
+"""Free disk space or rest of the quota below which the page warns."""
+STOP_TIMEOUT_S = 60.0
+"""Time for the encoder to finish a file that a page stops."""
+MAX_DURATION_S = 3600.0
+CHECK_INTERVAL_S = 5.0
+"""Time between two checks of the free disk space."""
+
 logger = logging.getLogger("arview.live")
 
 
@@ -88,7 +98,7 @@ class Recorder:
         """
         self._feed.unlisten(self._slot.put)
         self._slot.close()
-        self._thread.join(self._options.stop_timeout_s)
+        self._thread.join(STOP_TIMEOUT_S)
         if self._thread.is_alive():
             self.fault = f"{self.path}: the encoder does not come back"
         return self._sink is not None and not self.fault
@@ -125,11 +135,11 @@ class Recorder:
         self._frames += 1
 
     def _may_continue(self) -> bool:
-        if time.monotonic() - self._disk_checked_s < self._options.check_interval_s:
+        if time.monotonic() - self._disk_checked_s < CHECK_INTERVAL_S:
             return True
         self._disk_checked_s = time.monotonic()
-        if self.seconds >= self._options.max_duration_s:
-            self.ended_by = f"the recording has ended: it was {self._options.max_duration_s / 60:.0f} minutes long"
+        if self.seconds >= MAX_DURATION_S:
+            self.ended_by = f"the recording has ended: it was {MAX_DURATION_S / 60:.0f} minutes long"
         else:
             self.ended_by = self._space().exhausted
         return not self.ended_by
@@ -175,7 +185,7 @@ def free_space(folder: Path, options: RecordingOptions, paths: Sequence[Path] = 
         options: the limits.
         paths: further recordings, beside those in the folder that pages have asked for; unfinished ones count, too.
     """
-    on_disk = shutil.disk_usage(folder).free - options.min_free_bytes
+    on_disk = shutil.disk_usage(folder).free - MIN_FREE_BYTES
     known = {*folder.glob("live_*"), *folder.glob(".live_*")}
     for path in paths:
         known |= {path, *path.parent.glob(f".{path.name}*"), *path.parent.glob(f"{path.name}*")}
@@ -186,8 +196,8 @@ def free_space(folder: Path, options: RecordingOptions, paths: Sequence[Path] = 
     left = options.quota_bytes - used
     if left < on_disk:
         gb = options.quota_bytes / 1e9
-        return Space(left, f"recordings fill their quota of {gb:g} GB; move some, or raise --quota", options.low_bytes)
-    return Space(on_disk, "the disk is almost full", options.low_bytes)
+        return Space(left, f"recordings fill their quota of {gb:g} GB; move some, or raise --quota", LOW_BYTES)
+    return Space(on_disk, "the disk is almost full", LOW_BYTES)
 
 
 @dataclass(frozen=True)
@@ -340,13 +350,13 @@ class Recordings:
 
     def check_space(self) -> None:
         """Look up the room for recordings if that was some time ago, in a thread, before `notices` has to do it."""
-        if time.monotonic() - self._checked[0] > 0.5 * self._options.check_interval_s:
+        if time.monotonic() - self._checked[0] > 0.5 * CHECK_INTERVAL_S:
             self._checked = time.monotonic(), self.space()
 
     def _recent_space(self) -> Space:
         """As `space`, looked up once in a while only: notices are made several times a second."""
         checked_s, space = self._checked
-        if space is None or time.monotonic() - checked_s > self._options.check_interval_s:
+        if space is None or time.monotonic() - checked_s > CHECK_INTERVAL_S:
             space = self.space()
             self._checked = time.monotonic(), space
         return space

@@ -9,12 +9,25 @@ import time
 import numpy as np
 
 from arview.errors import ArviewError, without_credentials
-from arview.live.options import StationOptions
 from arview.live.protocol import FRAME_IDS
 from arview.live.stream.feed import Feed
 from arview.live.stream.frames import DecodedFrame, IncomingFrame
 from arview.live.stream.notices import Notice, without_folder
 from arview.video import Frame, FrameSource, Image, open_source
+
+FIRST_PAUSE_S = 0.5
+"""Pause before the first reconnection; it doubles with each further one."""
+MAX_PAUSE_S = 8.0
+OPEN_TIMEOUT_S = 10.0
+READ_TIMEOUT_S = 3.0
+STUCK_S = 30.0
+"""A reader that neither delivers nor fails for so long is given up with its thread."""
+MAX_LOST = 8
+"""Readers given up; then the camera counts as broken."""
+FROZEN_S = 2.0
+"""Pictures that stay equal, pixel for pixel, for so long: sensors have noise."""
+SAMPLE_STEP_PX = 7
+"""Distance of the pixels that are compared."""
 
 logger = logging.getLogger("arview.live")
 
@@ -28,11 +41,10 @@ class StationCamera:
     Args:
         spec: the source, see `arview.video.open_source`.
         feed: receives the frames.
-        options: timeouts and pauses.
     """
 
-    def __init__(self, spec: str, feed: Feed, options: StationOptions | None = None) -> None:
-        self._spec, self._feed, self._options = spec, feed, options or StationOptions()
+    def __init__(self, spec: str, feed: Feed) -> None:
+        self._spec, self._feed = spec, feed
         self._ended = threading.Event()
         self._fault = ""
         self._count = 0
@@ -51,13 +63,12 @@ class StationCamera:
 
     def replace_if_stuck(self) -> None:
         """Give the camera another thread when opening or reading it does not come back."""
-        options = self._options
         if self._count and not self._is_live:
             return  # a file, whose frames may be far apart
-        if time.monotonic() - self._alive_s < options.stuck_s or self._ended.is_set() or self._lost >= options.max_lost:
+        if time.monotonic() - self._alive_s < STUCK_S or self._ended.is_set() or self._lost >= MAX_LOST:
             return
         self._lost += 1
-        self._fault = f"the camera does not answer, for {options.stuck_s:.0f} s"
+        self._fault = f"the camera does not answer, for {STUCK_S:.0f} s"
         logger.warning("%s; it is opened anew", self._fault)
         self._alive_s = time.monotonic()
         self._thread = threading.Thread(target=self._run, name="arview-station", daemon=True)
@@ -81,7 +92,7 @@ class StationCamera:
     def is_frozen(self) -> bool:
         """Whether the pictures have been identical for longer than the options allow."""
         since_s = self._same_since_s
-        return self._is_live and since_s is not None and time.monotonic() - since_s > self._options.frozen_s
+        return self._is_live and since_s is not None and time.monotonic() - since_s > FROZEN_S
 
     def notices(self) -> list[Notice]:
         """Conditions of the camera that viewers have to know of."""
@@ -95,15 +106,12 @@ class StationCamera:
         return []
 
     def _run(self) -> None:
-        options = self._options
-        pause_s = options.first_pause_s
+        pause_s = FIRST_PAUSE_S
         while not self._is_over:
             self._alive_s = time.monotonic()
             count = self._count
             try:
-                with open_source(
-                    self._spec, open_timeout_s=options.open_timeout_s, read_timeout_s=options.read_timeout_s
-                ) as source:
+                with open_source(self._spec, open_timeout_s=OPEN_TIMEOUT_S, read_timeout_s=READ_TIMEOUT_S) as source:
                     self._play(source)
                     fault = source.ended_reason or ("the camera delivers no more pictures" if source.is_live else "")
             except ArviewError as error:
@@ -115,11 +123,11 @@ class StationCamera:
                 return
             self._fault = without_folder(without_credentials(fault), self._spec)
             if self._count > count:
-                pause_s = options.first_pause_s
+                pause_s = FIRST_PAUSE_S
             if fault:
                 logger.warning("%s; trying again in %.1f s", fault, pause_s)
                 self._ended.wait(pause_s)
-                pause_s = min(2.0 * pause_s, options.max_pause_s)
+                pause_s = min(2.0 * pause_s, MAX_PAUSE_S)
 
     def _play(self, source: FrameSource) -> None:
         self._is_live = source.is_live
@@ -139,7 +147,7 @@ class StationCamera:
     def _put(self, frame: Frame, source: FrameSource) -> None:
         now_s = self._alive_s = time.monotonic()
         self._fault = ""
-        step = self._options.sample_step_px
+        step = SAMPLE_STEP_PX
         sample = frame.image[::step, ::step].copy()
         if self._sample is None or not np.array_equal(sample, self._sample):
             self._sample, self._same_since_s = sample, now_s

@@ -11,10 +11,16 @@ from typing import Protocol
 from starlette.responses import Response
 from starlette.types import Receive, Scope, Send
 
-from arview.live.options import LiveOptions
 from arview.live.stream.annotator import FrameAnnotator
 from arview.live.stream.feed import Feed, TrackedFrame
 from arview.live.stream.subject import OverlayStyle
+
+WATCH_FPS = 15.0
+"""Frame rate of these: enough to watch, at half the encoding work."""
+WATCH_TIMEOUT_S = 10.0
+"""A screen that takes no picture for so long is disconnected."""
+WATCH_REPEAT_S = 2.0
+"""Without a new picture the last one is sent again, to notice closed connections."""
 
 BOUNDARY = "arview-frame"
 
@@ -38,13 +44,12 @@ class MotionJpeg(Response):
 
     Args:
         hub: provides the feed.
-        options: frame rate and timeouts.
         may_watch: asked before each picture; the response ends when the device is no longer paired.
     """
 
-    def __init__(self, hub: Watchable, options: LiveOptions, may_watch: Callable[[], bool] = lambda: True) -> None:
+    def __init__(self, hub: Watchable, may_watch: Callable[[], bool] = lambda: True) -> None:
         super().__init__()
-        self._hub, self._options, self._may_watch = hub, options, may_watch
+        self._hub, self._may_watch = hub, may_watch
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Send pictures until the screen disconnects."""
@@ -65,16 +70,16 @@ class MotionJpeg(Response):
         while not disconnected.done() and self._may_watch():
             watched = self._hub.watched()
             newest = watched[0].newest if watched is not None else None
-            is_due = newest is not shown or time.monotonic() - sent_s > self._options.watch_repeat_s
+            is_due = newest is not shown or time.monotonic() - sent_s > WATCH_REPEAT_S
             if watched is None or newest is None or not is_due:
                 await asyncio.wait([disconnected], timeout=0.02)
                 continue
             content = await asyncio.to_thread(_jpeg, watched[1], newest)
             head = f"--{BOUNDARY}\r\nContent-Type: image/jpeg\r\nContent-Length: {len(content)}\r\n\r\n"
             message = {"type": "http.response.body", "body": head.encode() + content + b"\r\n", "more_body": True}
-            await asyncio.wait_for(send(message), self._options.watch_timeout_s)
+            await asyncio.wait_for(send(message), WATCH_TIMEOUT_S)
             shown, sent_s = newest, time.monotonic()
-            await asyncio.wait([disconnected], timeout=1.0 / self._options.watch_fps)
+            await asyncio.wait([disconnected], timeout=1.0 / WATCH_FPS)
 
 
 def _jpeg(annotator: FrameAnnotator, tracked: TrackedFrame) -> bytes:

@@ -20,7 +20,6 @@ from aiortc.mediastreams import MediaStreamError, MediaStreamTrack
 from av.video.frame import VideoFrame
 
 from arview.errors import InputError
-from arview.live.options import WebrtcOptions
 from arview.live.protocol import CHANNEL, ViewMode
 from arview.live.stream.annotator import AnnotatedFrame
 from arview.live.stream.documents import Document
@@ -29,6 +28,11 @@ from arview.live.stream.frames import IncomingFrame, from_stamped
 from arview.live.stream.newest import AsyncNewestSlot
 from arview.live.stream.stamp import stamped
 from arview.live.transport.receiving import reduce_latency, restrict_candidates
+
+MAX_CANDIDATES = 32
+"""ICE candidates in an offer."""
+MAX_BUFFERED_BYTES = 32_768
+"""Messages waiting on the data channel, about fifteen; later ones are dropped."""
 
 _CLOCK_HZ = 90_000
 MAX_MESSAGE = 1000
@@ -120,7 +124,6 @@ class Connection:
         viewer: the page.
         addresses: addresses at which ICE candidates are offered.
         on_end: called once when the connection has failed or the page has closed it.
-        options: limits.
 
     Attributes:
         is_connected: whether the connection is established.
@@ -133,11 +136,9 @@ class Connection:
         viewer: Viewer,
         addresses: Sequence[str],
         on_end: Callable[[], None],
-        options: WebrtcOptions | None = None,
     ) -> None:
         self._feed, self._viewer = feed, viewer
         self._addresses, self._on_end = addresses, on_end
-        self._options = options or WebrtcOptions()
         self._peer = RTCPeerConnection(RTCConfiguration(iceServers=[]))
         self._channel: Any = None
         self._track: OutgoingVideoTrack | None = None
@@ -158,7 +159,7 @@ class Connection:
         """
         try:
             await self._peer.setRemoteDescription(
-                RTCSessionDescription(_checked_offer(offer_sdp, self._options.max_candidates), "offer")
+                RTCSessionDescription(_checked_offer(offer_sdp, MAX_CANDIDATES), "offer")
             )
             videos = [one for one in self._peer.getTransceivers() if one.kind == "video"]
             if len(videos) != 1 or self._peer.sctp is None:
@@ -180,7 +181,7 @@ class Connection:
         channel = self._channel
         if channel is None or channel.readyState != "open":
             return
-        if channel.bufferedAmount > self._options.max_buffered_bytes:
+        if channel.bufferedAmount > MAX_BUFFERED_BYTES:
             self.dropped += 1
             return
         channel.send(json.dumps(document, allow_nan=False))

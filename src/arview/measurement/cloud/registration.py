@@ -26,54 +26,56 @@ TUKEY_SIGMAS, HUBER_SIGMAS = 4.685, 1.345
 """Tuning constants of the robust kernels: 95 % efficiency for normal errors."""
 
 
+KERNEL: Literal["tukey", "huber", "none"] = "tukey"
+"""Weighting of residuals: ``tukey`` ignores outliers, ``huber`` limits them, ``none`` is least squares. Its width
+starts at the first distance and shrinks to the noise; with a narrow kernel from the start, a face displaced by more
+than the noise would be taken for an outlier."""
+TRIM = 0.0
+"""Share of the points, those with the largest residuals, that each iteration leaves out."""
+DISTANCE_SIGMAS = 6.0
+"""Maximum distance in widths of the kernel."""
+SHRINK = 1.0 / 3.0
+"""Factor by which the width decreases in each iteration, until it reaches the noise."""
+SKIPS_EDGES = True
+"""Leave out points whose closest point lies on an edge: with noise they pull to its outside."""
+MIN_NORMAL_COSINE = 0.5
+"""Points whose normal makes a larger angle with the surface's belong to another face."""
+MIN_INFORMATION = 1e-4
+"""Motions with less information per point, as a share of the largest possible, are undetermined; rotations are
+converted by the size of the cloud."""
+SEED = 0
+"""Of the choice of these points."""
+
+
 @dataclass(frozen=True)
 class RegistrationOptions:
     """Options of the registration.
 
     Attributes:
-        kernel: weighting of residuals: ``tukey`` ignores outliers, ``huber`` limits them, ``none`` is least squares.
-            Its width starts at the first distance and shrinks to the noise; with a narrow kernel from the start, a face
-            displaced by more than the noise would be taken for an outlier.
-        trim: share of the points, those with the largest residuals, that each iteration leaves out.
         first_distance_mm: maximum distance of points from the surface in the first iteration.
         last_distance_mm: maximum distance in the last iteration, unless the noise is larger.
-        distance_sigmas: maximum distance in widths of the kernel.
-        shrink: factor by which the width decreases in each iteration, until it reaches the noise.
         threshold_mm, threshold_deg: converged when a step moves the centre and rotates the points by less than this.
         max_iterations: of the solver, which needs 4 to 15.
-        skips_edges: leave out points whose closest point lies on an edge: with noise they pull to its outside.
-        min_normal_cosine: points whose normal makes a larger angle with the surface's belong to another face.
-        min_information: motions with less information per point, as a share of the largest possible, are undetermined;
-            rotations are converted by the size of the cloud.
         min_points: fewer points cannot be registered.
         min_width_mm: lower bound of the kernel's width: surfaces displaced by less are never treated as outliers.
         noise_points: points from which the noise is estimated; 0 assumes independent errors, which makes the covariance
             far too small for real clouds.
-        seed: of the choice of these points.
     """
 
-    kernel: Literal["tukey", "huber", "none"] = "tukey"
-    trim: float = 0.0
     first_distance_mm: float = 5.0
     last_distance_mm: float = 0.2
-    distance_sigmas: float = 6.0
-    shrink: float = 1.0 / 3.0
     threshold_mm: float = 1e-4
     threshold_deg: float = 1e-4
     max_iterations: int = 60
-    skips_edges: bool = True
-    min_normal_cosine: float = 0.5
-    min_information: float = 1e-4
     min_points: int = 50
     min_width_mm: float = 0.0
     noise_points: int = 240
-    seed: int = 0
 
     def __post_init__(self) -> None:
-        if self.kernel not in ("tukey", "huber", "none"):
-            raise InputError(f"registration: kernel {self.kernel!r}, expected tukey, huber or none")
-        if not 0.0 <= self.trim < 0.9:
-            raise InputError(f"registration: trim {self.trim} must be at least 0 and below 0.9")
+        if KERNEL not in ("tukey", "huber", "none"):
+            raise InputError(f"registration: kernel {KERNEL!r}, expected tukey, huber or none")
+        if not 0.0 <= TRIM < 0.9:
+            raise InputError(f"registration: trim {TRIM} must be at least 0 and below 0.9")
         if not 0.0 < self.last_distance_mm <= self.first_distance_mm:
             raise InputError(
                 f"registration: distances {self.first_distance_mm} … {self.last_distance_mm} mm must be positive and "
@@ -207,7 +209,7 @@ def register_to_surface(
     radius = radius_mm or float(np.sqrt(np.mean(np.sum((apply(pose, points) - center) ** 2, axis=1)))) or 1.0
     scales = _scales(radius)
     basis = np.eye(6) if free is None else _orthonormal(free / scales)
-    width, hint, converged = o.first_distance_mm / o.distance_sigmas, None, False
+    width, hint, converged = o.first_distance_mm / DISTANCE_SIGMAS, None, False
     iterations = 0
     while iterations < o.max_iterations:
         iterations += 1
@@ -217,11 +219,11 @@ def register_to_surface(
         pose = move_about(center, twist) @ pose
         hint = system.faces
         turned_deg = float(np.rad2deg(np.linalg.norm(twist[:3])))
-        is_narrow = width <= max(system.sigma, o.min_width_mm, o.last_distance_mm / o.distance_sigmas)
+        is_narrow = width <= max(system.sigma, o.min_width_mm, o.last_distance_mm / DISTANCE_SIGMAS)
         if is_narrow and np.linalg.norm(twist[3:]) < o.threshold_mm and turned_deg < o.threshold_deg:
             converged = True
             break
-        width = max(system.sigma, o.min_width_mm, o.shrink * width)
+        width = max(system.sigma, o.min_width_mm, SHRINK * width)
     system = _measure(points, normals, base, surface, usable_faces, pose, center, radius, basis, width, hint, o)
     return _result(system, pose, center, radius, basis, base, iterations, converged, o)
 
@@ -308,32 +310,32 @@ def _measure(
 ) -> _LinearSystem:  # fmt: skip
     """Residuals, weights and normal equations at a pose; rotations are in mm at ``radius``."""
     moved = apply(pose, points)
-    reach = min(max(o.distance_sigmas * width, o.last_distance_mm), o.first_distance_mm)
+    reach = min(max(DISTANCE_SIGMAS * width, o.last_distance_mm), o.first_distance_mm)
     closest = surface.closest(moved, reach, hint)
     residuals = closest.distances
     counts = closest.faces >= 0
     if usable_faces is not None:
         counts &= usable_faces[closest.faces]
-    if o.skips_edges:
+    if SKIPS_EDGES:
         counts &= ~closest.is_edge
     if point_normals is not None:
         cosine = np.sum((point_normals @ pose[:3, :3].T) * np.nan_to_num(closest.normals), axis=1)
-        counts &= (cosine >= o.min_normal_cosine) | ~point_normals.any(axis=1)
+        counts &= (cosine >= MIN_NORMAL_COSINE) | ~point_normals.any(axis=1)
     if np.count_nonzero(counts) < max(6, o.min_points // 4):
         raise InputError(
             f"registration: {np.count_nonzero(counts)} of {len(points)} points are within {reach:.2f} mm of the surface"
         )
     size = np.abs(np.where(counts, residuals, 0.0)) * np.sqrt(base)
-    if o.trim > 0.0:
-        counts &= size <= np.quantile(size[counts], 1.0 - o.trim)
+    if TRIM > 0.0:
+        counts &= size <= np.quantile(size[counts], 1.0 - TRIM)
     sigma = max(1.4826 * float(np.median(size[counts])), 1e-9)
-    weights = np.where(counts, _kernel(size / max(sigma, width, o.min_width_mm), o.kernel), 0.0) * base
+    weights = np.where(counts, _kernel(size / max(sigma, width, o.min_width_mm), KERNEL), 0.0) * base
     normals = np.where(counts[:, None], closest.normals, 0.0)
     rows = np.hstack([np.cross(moved - center, normals) / radius, normals])
     weighted = rows * weights[:, None]
     hessian = weighted.T @ rows
     values, vectors = np.linalg.eigh(basis @ hessian @ basis.T)
-    kept = values > o.min_information * weights.sum()
+    kept = values > MIN_INFORMATION * weights.sum()
     gradient = weighted.T @ np.where(counts, residuals, 0.0)
     return _LinearSystem(
         residuals, weights, rows, normals, moved, hessian, gradient, values[kept], vectors[:, kept], sigma,
@@ -366,11 +368,11 @@ def _result(
         residuals * own,
         (system.rows[used] * own[:, None]) @ determined.T,
         o.noise_points,
-        o.seed,
+        SEED,
     )
     # A residual moves the result by H⁻¹ Jᵀ w; the covariance is that of the sum of correlated residuals.
     pull = (determined.T / system.values) @ (determined @ (system.rows[used] * (weights / own)[:, None]).T)
-    scatter = spread_of_sum(system.moved[used], system.normals[used], pull, noise, o.seed)
+    scatter = spread_of_sum(system.moved[used], system.normals[used], pull, noise, SEED)
     undetermined = _orthogonal_complement(basis, determined)
     return Registration(
         surface_from_points=pose,

@@ -18,13 +18,20 @@ from numpy.typing import NDArray
 from arview.camera import Camera
 from arview.core.progress import Progress
 from arview.reconstruction.dense.kernels import PARALLAX, Problem, make_scratch
-from arview.reconstruction.dense.options import DenseOptions
+from arview.reconstruction.dense.options import BEST_SOURCES, DenseOptions
 from arview.reconstruction.dense.patchmatch import NEIGHBOURS, sweep, try_hypotheses
 from arview.reconstruction.dense.polish import polish
 from arview.reconstruction.dense.torch_search import search_torch
 from arview.reconstruction.dense.views import Cad, DenseView, Floats, Planes, cad_planes, relative_pose, sparse_planes
 from arview.reconstruction.gpu.device import torch_device
 from arview.reconstruction.types import SparseModel
+
+CAD_HYPOTHESES = True
+"""Also start from the surface of the CAD. It is only a hypothesis: photo-consistency decides."""
+NOISE = 1.5
+"""Standard deviation of the photos' noise in grey levels; less contrast does not count as texture."""
+GEOMETRIC_WEIGHT = 0.1
+"""Cost of one pixel of disagreement with the depth map of a source."""
 
 STEPS = (4, 2)
 """Pixels of the working size per pixel of each PatchMatch stage; the depth maps have the grid of the last stage."""
@@ -106,9 +113,7 @@ def _grown(planes: Planes, factor: int) -> Planes:
     return fine
 
 
-def _problem(
-    views: list[DenseView], index: int, greys: list[Floats], maps: list[Planes], step: int, options: DenseOptions
-) -> Problem:
+def _problem(views: list[DenseView], index: int, greys: list[Floats], maps: list[Planes], step: int) -> Problem:
     """The arrays of one view and its sources at one resolution; ``maps`` are the sources' depth maps, or empty."""
     view = views[index]
     camera = view.camera.scaled(greys[index].shape[1], greys[index].shape[0])
@@ -128,7 +133,7 @@ def _problem(
     maps_there = [maps[k] for k in sources] if maps else []
     region = _shrunk(view.region.astype(np.float32), step) > 0.5
     map_step = camera.width / maps[index].shape[1] if maps else 1.0
-    numbers = [options.noise**2, options.geometric_weight, map_step, options.best_sources]
+    numbers = [NOISE**2, GEOMETRIC_WEIGHT, map_step, BEST_SOURCES]
     return Problem(
         grey=greys[index],
         region=region.astype(np.uint8),
@@ -162,9 +167,9 @@ def _search(
     height, width = greys[index].shape
     camera = view.camera.scaled(width, height)
     given = [_grown(maps[index], STEPS[stage - 1] // step)] if maps else [sparse_planes(sparse, view.index, camera)]
-    if cad is not None and options.cad_hypotheses:
+    if cad is not None and CAD_HYPOTHESES:
         given.insert(0 if stage == 0 else 1, cad_planes(cad, view.cam_from_scan, camera))
-    problem = _problem(views, index, greys, maps, step, options)
+    problem = _problem(views, index, greys, maps, step)
     seed = (options.seed * 0x9E3779B1 + view.index * 0x85EBCA6B + stage * 0xC2B2AE35) & 0x7FFFFFFF
     low, high = 1.0 / view.farthest, 1.0 / view.nearest
     depth = 2.0 / (low + high)
@@ -189,13 +194,11 @@ def _search(
     return planes
 
 
-def _polished(
-    views: list[DenseView], greys: list[Floats], maps: list[Planes], options: DenseOptions, index: int
-) -> DepthMap:
+def _polished(views: list[DenseView], greys: list[Floats], maps: list[Planes], index: int) -> DepthMap:
     """Refine the depth map of one view at the working size."""
     planes = maps[index].copy()
     height, width = planes.shape[:2]
-    problem = _problem(views, index, greys, [], 1, options)
+    problem = _problem(views, index, greys, [], 1)
     unit_w = 1.0 / float(np.mean(problem.warps[:, PARALLAX]))
     scores, sigmas = np.empty((height, width), np.float32), np.empty((height, width), np.float32)
     scratch, indices = make_scratch(0.5 * (STEPS[-1] - 1))

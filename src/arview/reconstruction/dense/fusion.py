@@ -20,9 +20,23 @@ from arview.core.kernel import kernel
 from arview.core.progress import Progress
 from arview.geometry import Array, invert
 from arview.reconstruction.dense.depth import DepthMap
-from arview.reconstruction.dense.options import DenseOptions
+from arview.reconstruction.dense.options import MIN_VIEWS
 from arview.reconstruction.dense.views import Image
 from arview.reconstruction.types import DenseCloud
+
+MIN_ZNCC = 0.5
+"""Pixels with a lower mean correlation with the sources are not used."""
+MAX_SIGMA_PX = 0.25
+"""Pixels with a larger standard deviation, in pixels of parallax, are not used: no texture."""
+MAX_SPREAD_PX = 0.2
+"""Largest standard deviation of a merged point along its normal, in pixels of the maps at the point."""
+AGREEMENT_PX = 1.5
+"""Two depth maps agree if the point moves by less than this in the photo, in pixels of the maps (half the working size)
+…."""
+NORMAL_ANGLE_DEG = 20.0
+"""… and their normals differ by less than this."""
+GRAZING_DEG = 75.0
+"""Surfaces seen at a larger angle from their normal are not used."""
 
 MAX_NEIGHBOURS = 8
 """Other views against which a view is checked."""
@@ -61,7 +75,7 @@ class _Stack:
 
 
 def fuse(
-    maps: Sequence[DepthMap], images: Sequence[Image], options: DenseOptions, threads: int,
+    maps: Sequence[DepthMap], images: Sequence[Image], threads: int,
     progress: Progress,
 ) -> DenseCloud:  # fmt: skip
     """Fuse depth maps into the cloud of all points that ``options.min_views`` maps agree on.
@@ -69,21 +83,20 @@ def fuse(
     Args:
         maps: depth maps of the views.
         images: (H,W,3) uint8 RGB of each map's size.
-        options: see `DenseOptions`.
         threads: number of views worked on at a time.
         progress: called with the stage's name, views done and views in all.
 
     Returns:
         The cloud; empty when no points agree.
     """
-    stack = _stacked(maps, options)
+    stack = _stacked(maps)
     limits = np.array(
         [
-            options.agreement_px,
+            AGREEMENT_PX,
             _RELATIVE_DEPTH,
-            np.cos(np.deg2rad(options.normal_angle_deg)),
-            options.min_views,
-            options.max_spread_px,
+            np.cos(np.deg2rad(NORMAL_ANGLE_DEG)),
+            MIN_VIEWS,
+            MAX_SPREAD_PX,
         ]
     )
     neighbours = [_neighbour_views(maps, i) for i in range(len(maps))]
@@ -138,7 +151,7 @@ def _best_of_cells(
     return best[is_best]
 
 
-def _stacked(maps: Sequence[DepthMap], options: DenseOptions) -> _Stack:
+def _stacked(maps: Sequence[DepthMap]) -> _Stack:
     """All maps as arrays for kernels."""
     elements = []
     for m in maps:
@@ -148,8 +161,8 @@ def _stacked(maps: Sequence[DepthMap], options: DenseOptions) -> _Stack:
         a, b, w = planes[..., 1] * camera.fx, planes[..., 2] * camera.fy, planes[..., 0]
         c = w - a * x - b * y
         cosine = w / np.maximum(np.sqrt((a * a + b * b + c * c) * (x * x + y * y + 1.0)), 1e-30)
-        is_known = (w > 0) & (m.scores > 0) & (m.sigmas <= options.max_sigma_px * m.unit_w)
-        is_good = is_known & (m.scores >= options.min_zncc) & (cosine >= np.cos(np.deg2rad(options.grazing_deg)))
+        is_known = (w > 0) & (m.scores > 0) & (m.sigmas <= MAX_SIGMA_PX * m.unit_w)
+        is_good = is_known & (m.scores >= MIN_ZNCC) & (cosine >= np.cos(np.deg2rad(GRAZING_DEG)))
         element = np.stack([a, b, c, m.sigmas**2, np.where(is_known, w, 0.0), is_good], axis=-1)
         elements.append(element.reshape(-1, 6).astype(np.float32))
     sizes = np.array([(m.camera.width, m.camera.height) for m in maps])

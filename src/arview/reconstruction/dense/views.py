@@ -17,10 +17,16 @@ from arview.cad.model import Model
 from arview.camera import Camera
 from arview.errors import InputError
 from arview.geometry import Array, apply, invert
-from arview.reconstruction.dense.options import DenseOptions
+from arview.reconstruction.dense.options import SOURCES, DenseOptions
 from arview.reconstruction.intake.masks import mask_of
 from arview.reconstruction.types import PosedPhoto, SparseModel
 from arview.rendering.rasterizer import rasterise
+
+GOOD_ANGLE_DEG = (8.0, 25.0)
+"""Angles between two views of a point that count fully. Smaller angles do not determine depth, and at larger ones the
+surface looks different."""
+MAX_ANGLE_DEG = 50.0
+"""Views at a larger angle are no sources."""
 
 Image = NDArray[np.uint8]
 Floats = NDArray[np.float32]
@@ -67,7 +73,7 @@ class DenseView:
     sources: tuple[int, ...]
 
 
-def choose_sources(sparse: SparseModel, options: DenseOptions) -> list[tuple[int, ...]]:
+def choose_sources(sparse: SparseModel) -> list[tuple[int, ...]]:
     """For each photo the photos to compare with, best first: many common points, seen from useful angles.
 
     Every choice lowers the score of photos close to it, so that the sources lie all around (after Schönberger 2016 and
@@ -77,7 +83,7 @@ def choose_sources(sparse: SparseModel, options: DenseOptions) -> list[tuple[int
     seen = np.zeros((count, len(sparse.points_in_scan)), dtype=bool)
     seen[sparse.observed_photo, sparse.observed_point] = True
     centres = np.stack([photo.centre_in_scan for photo in sparse.photos])
-    low, high = options.good_angle_deg
+    low, high = GOOD_ANGLE_DEG
     score = np.zeros((count, count))
     apart = np.zeros((count, count))
     for i in range(count):
@@ -89,14 +95,14 @@ def choose_sources(sparse: SparseModel, options: DenseOptions) -> list[tuple[int
             cosine = np.sum(a * b, axis=1) / (np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1))
             angle = np.rad2deg(np.arccos(np.clip(cosine, -1.0, 1.0)))
             weights = np.clip(angle / low, 0.0, 1.0) ** 2
-            weights *= np.clip((options.max_angle_deg - angle) / (options.max_angle_deg - high), 0.0, 1.0)
+            weights *= np.clip((MAX_ANGLE_DEG - angle) / (MAX_ANGLE_DEG - high), 0.0, 1.0)
             score[i, j] = score[j, i] = weights.sum()
             apart[i, j] = apart[j, i] = np.median(angle)
     chosen: list[tuple[int, ...]] = []
     for i in range(count):
         left = score[i].copy()
         order: list[int] = []
-        while len(order) < options.sources and left.max() > 0.02 * score[i].max() > 0:
+        while len(order) < SOURCES and left.max() > 0.02 * score[i].max() > 0:
             best = int(np.argmax(left))
             order.append(best)
             left *= np.clip(np.where(apart[best] > 0, apart[best], 90.0) / low, 0.0, 1.0)

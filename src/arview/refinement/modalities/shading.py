@@ -52,22 +52,22 @@ CREASE_DEG = 40.0
 """Faces that meet at a larger angle have an edge between them."""
 
 
+RADIUS_PX = 26.0
+"""Half diameter of the part in the reduced picture; smaller parts are not enlarged."""
+REACH = 1.15
+"""Half size of the crop, in half diameters of the part."""
+
+
 @dataclass(frozen=True)
 class ShadingOptions:
     """Options of the shading modality.
 
     Attributes:
         gain: weight of the shading relative to edges and colours, by the residual variance of the brightness.
-        radius_px: half diameter of the part in the reduced picture; smaller parts are not enlarged.
-        reach: half size of the crop, in half diameters of the part.
-        min_curved_share: share of curved surface needed, because any light can explain the brightness of flat faces.
         rounds: updates of the pose.
     """
 
     gain: float = 5.0
-    radius_px: float = 26.0
-    reach: float = 1.15
-    min_curved_share: float = 0.2
     rounds: int = 4
 
 
@@ -156,7 +156,7 @@ def corner_normals(surface: Surface) -> NDArray[np.float32]:
 
 
 def crop_for_shading(
-    gray: NDArray[np.uint8], camera: Camera, diameter_mm: float, cam_from_body: Array, options: ShadingOptions
+    gray: NDArray[np.uint8], camera: Camera, diameter_mm: float, cam_from_body: Array
 ) -> ShadingCrop | None:
     """Reduced picture around the part for `refine_by_shading`; None where the part is not in the picture.
 
@@ -165,7 +165,6 @@ def crop_for_shading(
         camera: camera of the picture. Its distortion moves the part as a whole; within the part it is neglected.
         diameter_mm: diameter of the part.
         cam_from_body: (4,4) rough pose.
-        options: see `ShadingOptions`.
     """
     place = cam_from_body[:3, 3]
     center = camera.project(place)
@@ -173,9 +172,9 @@ def crop_for_shading(
         return None
     radius_px = 0.5 * diameter_mm * camera.fx / float(np.linalg.norm(place))
     limits = np.array([camera.width, camera.height])
-    first = np.clip(np.floor(center - options.reach * radius_px), 0, limits).astype(int)
-    last = np.clip(np.ceil(center + options.reach * radius_px), 0, limits).astype(int)
-    scale = min(1.0, options.radius_px / radius_px)
+    first = np.clip(np.floor(center - REACH * radius_px), 0, limits).astype(int)
+    last = np.clip(np.ceil(center + REACH * radius_px), 0, limits).astype(int)
+    scale = min(1.0, RADIUS_PX / radius_px)
     size = np.round(scale * (last - first)).astype(int)
     if np.any(size < 2 * RIM_PX + 4):
         return None

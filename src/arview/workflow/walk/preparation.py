@@ -16,6 +16,7 @@ from arview.reconstruction.memory import SparseMemory
 from arview.reconstruction.pairs import KnownPairs
 from arview.reconstruction.run import reconstruct
 from arview.reconstruction.sparse import match_by_appearance, moving_features
+from arview.reconstruction.still import MAX_SHIFT_PX
 from arview.reconstruction.types import Photo
 from arview.workflow.prepare import Prepared
 from arview.workflow.walk.job import JobFolder
@@ -77,7 +78,7 @@ class PhotoPreparation:
             ).intake  # fmt: skip
             sparse = options.sparse
             features, remarks = moving_features(intake.photos, sparse, self.threads, _nothing, self.memory)
-            min_move_px = sparse.still.max_shift_px if remarks else 0.0
+            min_move_px = MAX_SHIFT_PX if remarks else 0.0
             known = KnownPairs(poses=poses_of(photos))
             match_by_appearance(
                 intake.photos, features, sparse, self.threads, _nothing, min_move_px, known, self.memory

@@ -16,7 +16,10 @@ from arview.reconstruction.intake.kept import keeping_photos
 from arview.workflow.lock import exclusive_access
 from arview.workflow.walk.job import JobFolder
 from arview.workflow.walk.recheck import RecheckWorker
-from arview.workflow.walk.worker import WalkOptions, WalkWorker
+from arview.workflow.walk.worker import WalkWorker
+
+NICENESS = 5
+"""Of the process while the user waits …."""
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -39,10 +42,9 @@ def main(arguments: Sequence[str]) -> int:
 def _run(folder: Path) -> int:
     try:
         job = JobFolder.open(folder)
-        options = WalkOptions()
-        os.nice(max(0, options.niceness - os.nice(0)))
+        os.nice(max(0, NICENESS - os.nice(0)))
         with exclusive_access(job.path, ".worker.lock", waits=False), keeping_photos():
-            return 0 if worker_of(job, options).run() else 3
+            return 0 if worker_of(job).run() else 3
     except ArviewError as error:
         print(error, file=sys.stderr)
         return 2
@@ -51,6 +53,6 @@ def _run(folder: Path) -> int:
         return 1
 
 
-def worker_of(job: JobFolder, options: WalkOptions) -> WalkWorker:
+def worker_of(job: JobFolder) -> WalkWorker:
     """The worker for a first measurement or a re-check."""
-    return WalkWorker(job, options) if job.components is None else RecheckWorker(job, options)
+    return WalkWorker(job) if job.components is None else RecheckWorker(job)

@@ -35,7 +35,7 @@ from arview.workflow.new_inspection import new_inspection
 from arview.workflow.prepare import Prepared
 from arview.workflow.walk.job import JobFolder
 from arview.workflow.walk.preparation import photo_files, poses_of
-from arview.workflow.walk.worker import WalkOptions, WalkWorker, prepared_of
+from arview.workflow.walk.worker import WalkWorker, prepared_of
 
 _DRAWN_PX = 1000
 """Longer side at which components are drawn to find the features on them."""
@@ -48,11 +48,10 @@ class RecheckWorker(WalkWorker):
 
     Args:
         job: the re-check.
-        options: see `WalkOptions`.
     """
 
-    def __init__(self, job: JobFolder, options: WalkOptions | None = None) -> None:
-        super().__init__(job, options)
+    def __init__(self, job: JobFolder) -> None:
+        super().__init__(job)
         parent = job.parent
         if parent is None:
             raise InputError(f"job {job.id}: is no re-check")

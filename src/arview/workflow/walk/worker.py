@@ -10,7 +10,7 @@ import os
 import time
 import traceback
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import UTC, datetime
 from typing import Any
 
@@ -33,15 +33,14 @@ from arview.workflow.walk.records import WalkState
 _POLL_S = 0.1
 
 
-@dataclass(frozen=True)
-class WalkOptions:
-    """Options of a measurement while photos arrive."""
-
-    first_rough: int = 5  # photos of the first provisional measurement
-    rough_retry: int = 2  # photos more after which it is tried again when it failed
-    rough_growth: float = 2.0  # photos of the next provisional measurement, as a multiple of those of the last one
-    niceness: int = 5  # of the process while the user waits …
-    background_niceness: int = 15  # … and while the cloud and the report follow
+FIRST_ROUGH = 5
+"""Photos of the first provisional measurement."""
+ROUGH_RETRY = 2
+"""Photos more after which it is tried again when it failed."""
+ROUGH_GROWTH = 2.0
+"""Photos of the next provisional measurement, as a multiple of those of the last one."""
+BACKGROUND_NICENESS = 15
+"""… and while the cloud and the report follow."""
 
 
 class WalkWorker:
@@ -49,11 +48,10 @@ class WalkWorker:
 
     Args:
         job: the job.
-        options: see `WalkOptions`.
     """
 
-    def __init__(self, job: JobFolder, options: WalkOptions | None = None) -> None:
-        self.job, self.options = job, options or WalkOptions()
+    def __init__(self, job: JobFolder) -> None:
+        self.job = job
         self.state = job.state()
         self.memory = SparseMemory(job.path / "features")
         self.threads = os.cpu_count() or 1
@@ -99,7 +97,7 @@ class WalkWorker:
         """Work ahead until the walk ends, and measure roughly in between."""
         preparation = PhotoPreparation(self.job, prepared, self.memory, self.threads, self._prepare_more)
         preparation.start()
-        wanted = self.options.first_rough
+        wanted = FIRST_ROUGH
         try:
             while not self.job.is_ended:
                 photos = len(self.job.photos())
@@ -108,8 +106,8 @@ class WalkWorker:
                 if preparation.ready >= wanted:
                     count = preparation.ready
                     is_measured = self._measure_roughly(prepared, count)
-                    more = round(self.options.rough_growth * count)
-                    wanted = more if is_measured else count + self.options.rough_retry
+                    more = round(ROUGH_GROWTH * count)
+                    wanted = more if is_measured else count + ROUGH_RETRY
                 time.sleep(_POLL_S)
         finally:
             preparation.end()
@@ -160,7 +158,7 @@ class WalkWorker:
         def on_verdict(inspection: Inspection) -> None:
             first.append(inspection)
             self._say_verdict(inspection, was_done)
-            os.nice(max(0, self.options.background_niceness - os.nice(0)))
+            os.nice(max(0, BACKGROUND_NICENESS - os.nice(0)))
             if not was_done or not (self.job.path / "report.html").is_file():
                 self._report(prepared.part)  # without the cloud, so that there is one to decide and sign in
 
