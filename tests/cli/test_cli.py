@@ -19,9 +19,9 @@ import pytest
 import trimesh
 from click.testing import CliRunner, Result
 
-import arview.evaluation.run
 import arview.guideviews.cache
 import arview.tracking
+import arview_lab.evaluation.run
 from arview.cad import load_part
 from arview.cad.viewpoint import viewpoint
 from arview.cli import ExitCode, main
@@ -85,7 +85,7 @@ def room(tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     # Guide views are kept away from the user's; compiled kernels stay where they are found.
     monkeypatch.setattr(arview.guideviews.cache, "cache_folder", lambda: cache)
     monkeypatch.setattr(arview.tracking, "TrackingSession", FakeSession)
-    monkeypatch.setattr(arview.evaluation.run, "TrackingSession", FakeSession)
+    monkeypatch.setattr(arview_lab.evaluation.run, "TrackingSession", FakeSession)
     return tmp_path
 
 

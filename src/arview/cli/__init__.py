@@ -9,7 +9,6 @@ from arview.cli import (
     calibrate,
     capture,
     check,
-    evaluate,
     export,
     guideviews,
     history,
@@ -18,7 +17,6 @@ from arview.cli import (
     measure,
     reconstruct,
     report,
-    study,
     verify,
     warmup,
 )
@@ -32,7 +30,6 @@ __all__ = [
     "calibrate",
     "capture",
     "check",
-    "evaluate",
     "export",
     "guideviews",
     "history",
@@ -42,7 +39,6 @@ __all__ = [
     "measure",
     "reconstruct",
     "report",
-    "study",
     "verify",
     "warmup",
 ]

@@ -10,7 +10,7 @@ import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,6 @@ from arview.cad.model import Component, Model
 from arview.cad.part import Part
 from arview.errors import InputError
 from arview.geometry import Array, apply, invert, rigid
-from arview.measurement.cloud.classical_icp import ClassicalIcpOptions, icp_move
 from arview.measurement.cloud.mesh_surface import MeshSurface
 from arview.measurement.cloud.placing import check_belongs
 from arview.measurement.cloud.points import CloudPoints, prepare_cloud
@@ -59,8 +58,6 @@ class CloudDeviationOptions:
         rival_cost: a second minimum is reported when its cost is less than this many times the best one's.
         rival_mm: minima nearer to each other are one, and not reported.
         registration: options of the solver.
-        way: ``icp`` replaces each position by that of the classical ICP, for comparison.
-        icp: its options.
     """
 
     band_mm: float = 5.0
@@ -77,8 +74,6 @@ class CloudDeviationOptions:
     rival_cost: float = 1.5
     scanned_mm: float = 6.0
     rival_mm: float = 0.2
-    way: Literal["surface", "icp"] = "surface"
-    icp: ClassicalIcpOptions = field(default_factory=ClassicalIcpOptions)
     registration: RegistrationOptions = field(
         default_factory=lambda: RegistrationOptions(min_width_mm=0.1, threshold_mm=1e-3, threshold_deg=1e-3)
     )
@@ -152,7 +147,7 @@ def measure_components_in_cloud(
     # One thread for BLAS: the matrices are small, and the work is parallel over components.
     with threadpool_limits(1, "blas"), ThreadPoolExecutor(max(1, min(4, os.cpu_count() or 1))) as threads:
         components = list(
-            threads.map(lambda name: _cloud_component(name, model, part, views, o), names or part.inspected)
+            threads.map(lambda name: cloud_component(name, model, part, views, o), names or part.inspected)
         )
         if views is None:
             components = _only_scanned(components, points, o)
@@ -167,8 +162,6 @@ def measure_components_in_cloud(
             return _measure(moved, points, found.nominal_from_measured, o)
 
         second = list(threads.map(again, range(len(components))))
-        if o.way == "icp":
-            second = [_by_icp(found, c, points, o) for found, c in zip(second, components, strict=True)]
         return list(
             threads.map(
                 lambda i: _with_swapped_name(second[i], components[i], components, points, o), range(len(second))
@@ -200,7 +193,7 @@ def spin_moves(component: Component, surface: MeshSurface, part: Part | None, mi
     return vectors[values > 0.1]
 
 
-def _cloud_component(
+def cloud_component(
     name: str, model: Model, part: Part | None, views: SurfaceVisibility | None, o: CloudDeviationOptions
 ) -> CloudComponent:  # fmt: skip
     """A component with what the photos can see of it, and with its neighbours at nominal."""
@@ -292,7 +285,7 @@ def _measure(
     name = c.component.name
     if len(c.samples) == 0:
         return NotMeasured(name, "cloud", "none of its surface is visible in the photos")
-    near, own = _crop(c, cloud, o)
+    near, own = crop_component(c, cloud, o)
     missing = _missing(c, near, own, o)
     if missing is not None:
         return missing
@@ -315,29 +308,7 @@ def _measure(
     return _move(c, fit, support, o)
 
 
-def _by_icp(
-    found: Move | NotMeasured, c: CloudComponent, cloud: CloudPoints, o: CloudDeviationOptions
-) -> Move | NotMeasured:
-    """The same component placed by the classical ICP."""
-    if not isinstance(found, Move):
-        return found
-    own = _crop(c, cloud, o)[1]
-    samples, faces = c.surface.sample(max(0.5 * o.icp.grid_mm, 0.2))
-    usable = c.usable_faces[faces]
-    try:
-        return icp_move(
-            found,
-            own.points,
-            samples[usable],
-            c.surface.face_normals[faces[usable]],
-            c.component.bounds_in_model,
-            o.icp,
-        )
-    except InputError as error:
-        return NotMeasured(c.component.name, "cloud", str(error).removeprefix("registration: "))
-
-
-def _crop(c: CloudComponent, cloud: CloudPoints, o: CloudDeviationOptions) -> tuple[CloudPoints, CloudPoints]:
+def crop_component(c: CloudComponent, cloud: CloudPoints, o: CloudDeviationOptions) -> tuple[CloudPoints, CloudPoints]:
     """Points around the component, and those of them that may belong to it."""
     low, high = c.component.bounds_in_model[0] - o.band_mm, c.component.bounds_in_model[1] + o.band_mm
     near = cloud.only(np.all((cloud.points >= low) & (cloud.points <= high), axis=1))
