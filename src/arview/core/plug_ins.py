@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from importlib.metadata import EntryPoint, entry_points
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from arview.errors import InputError
+
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
 
 
 def find_plug_ins(group: str) -> dict[str, EntryPoint]:
@@ -13,6 +15,8 @@ def find_plug_ins(group: str) -> dict[str, EntryPoint]:
 
     Where two packages use one name, the package that comes first in the alphabet has it.
     """
+    from importlib.metadata import entry_points
+
     found: dict[str, EntryPoint] = {}
     for entry in sorted(entry_points(group=group), key=lambda entry: (entry.name, package_of(entry))):
         found.setdefault(entry.name, entry)
