@@ -1,6 +1,7 @@
 """The command line: each command parses its options, calls one function of a library room and prints the result.
 
-There is a file for each command; other packages add commands of their own (docs/reference/plug-ins.md). Heavy libraries are imported inside the commands, so that ``arview --help`` is quick.
+There is a file for each command; other packages add commands of their own (docs/reference/plug-ins.md). Heavy libraries
+are imported inside the commands, so that ``arview --help`` is quick.
 """
 
 from arview.cli import (
