@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from helpers.source_tree import imports, modules
+import ast
+from pathlib import Path
+
+from helpers.source_tree import imports, lab_files, modules, source_files, tree
 
 ROOMS = (
     ("errors",),
@@ -26,7 +29,7 @@ ROOMS = (
     ("capture",),
     ("measurement",),
     ("rework", "decisions"),
-    ("report", "history", "calibration", "acceptance", "evaluation"),
+    ("report", "history", "calibration", "acceptance"),
     ("workflow",),
     ("live",),
     ("studio",),
@@ -72,6 +75,19 @@ def test_rooms_that_know_nothing_of_each_other() -> None:
     for name in modules():
         if name not in FRONT:
             assert not {room(other) for other in imports(name)} & FORBIDDEN.get(room(name), set()), name
+
+
+def test_the_program_knows_nothing_of_the_laboratory() -> None:
+    def knows(path: Path) -> bool:
+        return any(
+            name.split(".")[0] == "arview_lab"
+            for node in ast.walk(tree(path))
+            if isinstance(node, ast.Import | ast.ImportFrom)
+            for name in ([alias.name for alias in node.names] if isinstance(node, ast.Import) else [node.module or ""])
+        )
+
+    assert sum(map(knows, lab_files())) > 20
+    assert [path.name for path in source_files() if knows(path)] == []
 
 
 def test_there_is_no_circle() -> None:

@@ -15,9 +15,9 @@ from tqdm import tqdm
 from arview.detection import Detector, DetectorOptions
 from arview.detection.confidence import MIN_OUTLINE, ConfidenceTerms
 from arview.errors import InputError
-from arview.evaluation.protocols import spread_frames
-from arview.evaluation.semisynthetic import frames_without_part
 from arview.geometry import Array
+from arview_lab.evaluation.protocols import spread_frames
+from arview_lab.semisynthetic import frames_without_part
 from photos import all_photos
 from profile_ranker_examples import ALIKE_PIXELS, REFINED_NEAR, is_alike, is_near, pictures_of
 from recordings import scenes

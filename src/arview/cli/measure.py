@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import click
 
@@ -83,8 +83,6 @@ INSPECTION_distances: coloured PLY, a picture, histograms.""",
               help="Guard band as a multiple of U; 0 is simple acceptance.")  # fmt: skip
 @click.option("--methods", callback=_parse_methods, default=",".join(METHODS), show_default=True, metavar="LIST",
               help="Measuring methods, separated by commas.")  # fmt: skip
-@click.option("--registration", type=click.Choice(["surface", "icp"]), default="surface", show_default=True,
-              help="In the cloud: to the CAD's exact surface, or by classical ICP, for comparison.")  # fmt: skip
 @click.option("--correct-bias", is_flag=True, help="Correct distances for the bias that noise gives small ones.")
 @click.option("--no-monte-carlo", is_flag=True, help="Combine uncertainties by root sum of squares only.")
 @click.option("--no-maps", is_flag=True, help="Do not write the pictures and the PLY of the distance map.")
@@ -104,7 +102,6 @@ def measure(
     tolerance: float | None,
     guard: float,
     methods: tuple[Method, ...],
-    registration: Literal["surface", "icp"],
     correct_bias: bool,
     no_monte_carlo: bool,
     no_maps: bool,
@@ -132,7 +129,6 @@ def measure(
     options = MeasureOptions(
         methods=methods,
         tolerance_mm=tolerance,
-        registration=registration,
         corrects_bias=correct_bias,
         uses_inconsistent=anyway,
         maps_folder=None if no_maps else target.parent / f"{target.stem}_distances",

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
 
 from arview.errors import InputError
 from arview.measurement.types import Method, Move, NotMeasured
@@ -24,7 +23,6 @@ class MeasureOptions:
     tolerance_mm: float | None = None  # for components without a tolerance in the part file; None: no verdict
     corrects_bias: bool = False  # decide on the most likely true distance instead of the measured one
     uses_inconsistent: bool = False  # continue though the reconstruction does not have the shape of the CAD
-    registration: Literal["surface", "icp"] = "surface"  # in the cloud: to the CAD's exact surface, or by classical ICP
     maps_folder: Path | None = None  # where pictures and PLY of the distance map are written; None: nowhere
     uncertainty: UncertaintyOptions = field(default_factory=UncertaintyOptions)
     decision: DecisionOptions = field(default_factory=DecisionOptions)

@@ -150,7 +150,7 @@ def measure_all(
         for name, by_method in both.items():
             found[name] += [by_method[method] for method in options.methods if method in by_method]
     if "cloud" in options.methods and reconstruction.cloud is not None:
-        from arview.measurement.cloud.deviation import CloudDeviationOptions, measure_components_in_cloud
+        from arview.measurement.cloud.deviation import measure_components_in_cloud
 
         tell("cloud", 0, 1)
         try:
@@ -159,7 +159,6 @@ def measure_all(
                 part.model,
                 part,
                 reconstruction.sparse.photos,
-                CloudDeviationOptions(way=options.registration),
                 names=names if views is None else None,
             )
         except InputError as error:

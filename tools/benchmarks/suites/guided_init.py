@@ -6,12 +6,12 @@ import time
 
 import numpy as np
 
-from arview.evaluation import PoseMeter, Scene, scene_guide_views
-from arview.evaluation.protocols import box_symmetries
 from arview.geometry import Array, apply, exp_so3, rigid, rotation_angle_rad
 from arview.tracking import SessionOptions
 from arview.tracking.guided_init import GuidedInit
 from arview.video import Image
+from arview_lab.evaluation import PoseMeter, Scene, scene_guide_views
+from arview_lab.evaluation.protocols import box_symmetries
 from rows import ResultRow, timing, watched
 from suites.detection import BOXES
 

@@ -9,9 +9,6 @@ from typing import Any
 import cv2
 import numpy as np
 
-from arview.evaluation import PoseMeter, Scene, SceneFrame, scene_guide_views
-from arview.evaluation.protocols import box_symmetries
-from arview.evaluation.run import COARSE, IN_VIEW
 from arview.geometry import Array, apply, exp_so3, rigid
 from arview.guideviews import GuideViewSet
 from arview.pose import Pose, TrackingState
@@ -19,6 +16,9 @@ from arview.refinement.modalities.edge import smoothed
 from arview.tracking import Tracker, TrackingSession
 from arview.tracking.tracker_options import STAGES
 from arview.video import Image
+from arview_lab.evaluation import PoseMeter, Scene, SceneFrame, scene_guide_views
+from arview_lab.evaluation.protocols import box_symmetries
+from arview_lab.evaluation.run import COARSE, IN_VIEW
 from recordings import PHOTO_SEQUENCES
 from rows import ResultRow, watched
 from suites.real_conditions import RealConditionsSuite

@@ -10,7 +10,7 @@ import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,6 @@ from arview.cad.model import Component, Model
 from arview.cad.part import Part
 from arview.errors import InputError
 from arview.geometry import Array, apply, invert, rigid
-from arview.measurement.cloud.classical_icp import ClassicalIcpOptions, icp_move
 from arview.measurement.cloud.mesh_surface import MeshSurface
 from arview.measurement.cloud.placing import check_belongs
 from arview.measurement.cloud.points import CloudPoints, prepare_cloud
@@ -72,19 +71,7 @@ REGISTRATION = RegistrationOptions(min_width_mm=0.1, threshold_mm=1e-3, threshol
 
 @dataclass(frozen=True)
 class CloudDeviationOptions:
-    """Options of measuring components in a cloud.
-
-    Attributes:
-        way: ``icp`` replaces each position by that of the classical ICP, for comparison.
-        icp: its options.
-    """
-
-    way: Literal["surface", "icp"] = "surface"
-    icp: ClassicalIcpOptions = field(default_factory=ClassicalIcpOptions)
-
-    def __post_init__(self) -> None:
-        if not (BAND_MM > 0 and GRID_MM >= 0 and JOINT_MM >= 0):
-            raise InputError("cloud measurement: band, grid and joint must be positive")
+    """Options of measuring components in a cloud."""
 
 
 @dataclass(frozen=True)
@@ -98,7 +85,7 @@ class CloudComponent:
         contact: (C,3) samples where it touches others.
         usable_faces: (F,) faces that the photos can see.
         spins: (K,6) motions about the centre, rotations scaled by ``radius_mm``, that leave its shape unchanged.
-        joint_mm: see `CloudDeviationOptions`.
+        joint_mm: as `JOINT_MM`, and of a flat component at most a quarter of its height.
     """
 
     component: Component
@@ -150,7 +137,7 @@ def measure_components_in_cloud(
     views = SurfaceVisibility(model, photos) if photos else None
     # One thread for BLAS: the matrices are small, and the work is parallel over components.
     with threadpool_limits(1, "blas"), ThreadPoolExecutor(max(1, min(4, os.cpu_count() or 1))) as threads:
-        components = list(threads.map(lambda name: _cloud_component(name, model, part, views), names or part.inspected))
+        components = list(threads.map(lambda name: cloud_component(name, model, part, views), names or part.inspected))
         if views is None:
             components = _only_scanned(components, points)
         first = list(threads.map(lambda c: _measure(c, points, None), components))
@@ -164,8 +151,6 @@ def measure_components_in_cloud(
             return _measure(moved, points, found.nominal_from_measured)
 
         second = list(threads.map(again, range(len(components))))
-        if o.way == "icp":
-            second = [_by_icp(found, c, points, o) for found, c in zip(second, components, strict=True)]
         return list(
             threads.map(lambda i: _with_swapped_name(second[i], components[i], components, points), range(len(second)))
         )
@@ -195,7 +180,7 @@ def spin_moves(component: Component, surface: MeshSurface, part: Part | None, mi
     return vectors[values > 0.1]
 
 
-def _cloud_component(
+def cloud_component(
     name: str, model: Model, part: Part | None, views: SurfaceVisibility | None
 ) -> CloudComponent:  # fmt: skip
     """A component with what the photos can see of it, and with its neighbours at nominal."""
@@ -279,7 +264,7 @@ def _measure(c: CloudComponent, cloud: CloudPoints, start: Array | None) -> Move
     name = c.component.name
     if len(c.samples) == 0:
         return NotMeasured(name, "cloud", "none of its surface is visible in the photos")
-    near, own = _crop(c, cloud)
+    near, own = crop_component(c, cloud)
     missing = _missing(c, near, own)
     if missing is not None:
         return missing
@@ -302,29 +287,7 @@ def _measure(c: CloudComponent, cloud: CloudPoints, start: Array | None) -> Move
     return _move(c, fit, support)
 
 
-def _by_icp(
-    found: Move | NotMeasured, c: CloudComponent, cloud: CloudPoints, o: CloudDeviationOptions
-) -> Move | NotMeasured:
-    """The same component placed by the classical ICP."""
-    if not isinstance(found, Move):
-        return found
-    own = _crop(c, cloud)[1]
-    samples, faces = c.surface.sample(max(0.5 * o.icp.grid_mm, 0.2))
-    usable = c.usable_faces[faces]
-    try:
-        return icp_move(
-            found,
-            own.points,
-            samples[usable],
-            c.surface.face_normals[faces[usable]],
-            c.component.bounds_in_model,
-            o.icp,
-        )
-    except InputError as error:
-        return NotMeasured(c.component.name, "cloud", str(error).removeprefix("registration: "))
-
-
-def _crop(c: CloudComponent, cloud: CloudPoints) -> tuple[CloudPoints, CloudPoints]:
+def crop_component(c: CloudComponent, cloud: CloudPoints) -> tuple[CloudPoints, CloudPoints]:
     """Points around the component, and those of them that may belong to it."""
     low, high = c.component.bounds_in_model[0] - BAND_MM, c.component.bounds_in_model[1] + BAND_MM
     near = cloud.only(np.all((cloud.points >= low) & (cloud.points <= high), axis=1))

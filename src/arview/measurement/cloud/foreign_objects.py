@@ -20,7 +20,7 @@ CELL_MM = 2.0
 MIN_AREA_MM2 = 40.0
 """Smaller objects are spatter or wrong points."""
 GRID_MM = 0.5
-"""Of the averaging, see `CloudDeviationOptions`."""
+"""Cell of the grid on which the cloud is averaged."""
 
 
 @dataclass(frozen=True)
