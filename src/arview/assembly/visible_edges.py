@@ -291,7 +291,7 @@ def _own_samples(
 ) -> NDArray[np.bool_]:  # fmt: skip
     """(N,) False for samples near a parallel edge of another component, or near a surface in front of them.
 
-    See `VisibleEdgeOptions` for the limits.
+    The limits are the constants of this module.
     """
     pixels, normals_px, depths, owners = samples.pixels, samples.normals_px, samples.depths, samples.component
     ids, depth = view.ids, view.depth_mm

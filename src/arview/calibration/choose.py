@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from arview.calibration.projection import PARAMETERS_OF, CalibratedLens, intrinsics_of, pose_of_board
-from arview.calibration.solve import information, solve
+from arview.calibration.solve import MIN_VIEWS, information, solve
 from arview.calibration.views import BoardView
 from arview.camera import Camera
 from arview.errors import InputError
@@ -36,10 +36,8 @@ class ChoiceOptions:
     candidates: int = 160  # views from which the choice is made
 
     def __post_init__(self) -> None:
-        if self.max_views < SolveOptions.min_views or self.candidates < self.max_views or not MAX_ERROR_RATIO > 1:
-            raise InputError(
-                f"choice of views: expected at least {SolveOptions.min_views} views and an error ratio above 1"
-            )
+        if self.max_views < MIN_VIEWS or self.candidates < self.max_views:
+            raise InputError(f"choice of views: expected at least {MIN_VIEWS} views, chosen from no fewer candidates")
 
 
 def choose_views(

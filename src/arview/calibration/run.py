@@ -75,18 +75,17 @@ def calibrate(
         InputError: nothing can be read, there is no board, there are too few views, or no camera explains them.
     """
     sightings = find_views(sources, board, progress)
-    min_views = MIN_VIEWS
-    if len(sightings.views) < min_views:
+    if len(sightings.views) < MIN_VIEWS:
         why = "; ".join(f"{name} {reason}" for name, reason in list(sightings.rejected.items())[:3])
         raise InputError(
             f"{sightings.label}: the board is seen in {len(sightings.views)} of {sightings.searched} pictures, at"
-            f" least {min_views} are needed, 20 are good" + (f" ({why})" if why else "")
+            f" least {MIN_VIEWS} are needed, 20 are good" + (f" ({why})" if why else "")
         )
     size = (sightings.width, sightings.height)
     views: Sequence[BoardView] = sightings.views
     try:
         views, left_out = choose_views(views, *size, choice, lens)
-        solution = solve(views, *size, solving, lens)
+        solution = solve(views, *size, lens)
     except InputError as error:
         advice = compare_lenses(views[: ChoiceOptions.max_views], *size, lens).advice
         raise InputError(f"{sightings.label}: {error}{f'; {advice}' if advice else ''}") from error

@@ -19,7 +19,7 @@ from arview.calibration.fisheye import adjust_fisheye
 from arview.calibration.projection import PARAMETERS_OF, CalibratedLens, lens_of, project
 from arview.calibration.views import MIN_CORNERS, BoardView
 from arview.camera import Camera
-from arview.camera.undistort import UndistortOptions
+from arview.camera.undistort import MAX_HALF_ANGLE_DEG
 from arview.errors import InputError
 from arview.geometry import Array, rigid
 
@@ -152,7 +152,7 @@ def seen_by_lens(camera: Camera, rays: Array) -> NDArray[np.bool_]:
     """(N,) whether rays (N,3) are judged: all of a Brown lens, of a fisheye those that `Undistorter` shows."""
     if lens_of(camera) is CalibratedLens.BROWN:
         return np.ones(len(rays), dtype=bool)
-    slope = float(np.tan(np.deg2rad(UndistortOptions.max_half_angle_deg)))
+    slope = float(np.tan(np.deg2rad(MAX_HALF_ANGLE_DEG)))
     with np.errstate(invalid="ignore"):
         return np.asarray(np.hypot(rays[:, 0], rays[:, 1]) <= slope)
 

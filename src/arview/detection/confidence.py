@@ -84,7 +84,7 @@ class ConfidenceTerms(NamedTuple):
         nearby_margin, distant_margin: bounded margins over competing hypotheses, see `Margins`.
         is_alone: 1 where neither margin is below the bound of the nearby one.
         view_richness: bounded log ratio of distinct lines in the view to the usual number of the part.
-        log_size: logarithm of the half diameter relative to `ConfidenceOptions.small_radius_px`, at most 0.
+        log_size: logarithm of the half diameter relative to `SMALL_RADIUS_PX`, at most 0.
         outline: support, sharpness and colours of the outline as one product, see `outline_score`.
     """
 

@@ -266,7 +266,7 @@ def displacement_texts(
     cosine = min(1.0, max(-1.0, 0.5 * (float(np.trace(moved[:3, :3])) - 1.0)))
     turn_deg = math.degrees(math.acos(cosine))
     digits = (2 if UNIT == "inch" else 1) if distance < 10.0 else (1 if UNIT == "inch" else 0)
-    away = f"≈ {distance / _MM_PER_UNIT[options.unit]:.{digits}f}{_UNIT_SUFFIX[options.unit]} away"
+    away = f"≈ {distance / _MM_PER_UNIT[UNIT]:.{digits}f}{_UNIT_SUFFIX[UNIT]} away"
     return away, (f"turned {turn_deg:.0f}°",) if turn_deg >= _MIN_TURN_DEG else ()
 
 

@@ -103,9 +103,16 @@ def placed_with_silhouettes(
 
 
 def _placed_by_part(
-    photos: Sequence[Photo], folder: Path, masks_folder: Path, silhouettes: Silhouettes,
-    place: Callable[[Sequence[Photo], Path], SparseModel], tell: Progress, whole: SparseModel | None, failure: CannotMeasureError | None, reason: str,
-) -> SparseModel:  # fmt: skip
+    photos: Sequence[Photo],
+    folder: Path,
+    masks_folder: Path,
+    silhouettes: Silhouettes,
+    place: Callable[[Sequence[Photo], Path], SparseModel],
+    tell: Progress,
+    whole: SparseModel | None,
+    failure: CannotMeasureError | None,
+    reason: str,
+) -> SparseModel:
     """The photos placed by the pixels of the part alone; as they were placed before where that places no more."""
     found = silhouettes.in_photos(photos, masks_folder, tell)
     masked = [replace(photo, mask=found.masks[photo.name]) for photo in photos if photo.name in found.masks]

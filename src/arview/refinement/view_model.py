@@ -16,7 +16,7 @@ from arview.core.kernel import kernel
 from arview.geometry import invert, rigid
 from arview.guideviews import GuideViewSet
 from arview.guideviews.mesh_edges import EDGE_CONTOUR, EDGE_SHARP
-from arview.refinement.modalities.shading import ShadingOptions, corner_normals, curved_share
+from arview.refinement.modalities.shading import corner_normals, curved_share
 from arview.refinement.projection import ViewArrays
 
 MIN_SEPARATION = 0.035
@@ -30,6 +30,8 @@ PARALLEL_COS = 0.7
 """Edges whose directions have a smaller cosine cross and are no neighbours."""
 END_ON = 0.02
 """Edges whose projected tangent is shorter than this are seen end-on and left out."""
+MIN_CURVED_SHARE = 0.2
+"""Share of curved surface that shading needs, because any light can explain the brightness of flat faces."""
 UNIT_16 = np.float32(1.0 / 32767.0)
 """Scale of the unit vectors that guide views store as 16-bit integers."""
 
@@ -66,7 +68,7 @@ class PartView:
             edge_kinds=np.array(raw["edge_kinds"]),
         )
         self.surface = views.surface
-        self.is_curved = curved_share(self.surface) >= ShadingOptions.min_curved_share
+        self.is_curved = curved_share(self.surface) >= MIN_CURVED_SHARE
         self.corner_normals = corner_normals(self.surface)
 
     @cached_property

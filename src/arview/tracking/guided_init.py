@@ -170,7 +170,7 @@ class GuidedInit:
     def lock(self, image: NDArray[np.uint8], cam_from_model: Array, min_quality: float) -> GuidedPose | None:
         """The pose of the part if it is certainly near the given one, else None.
 
-        A pose must be good enough, near enough (see `GuidedInitOptions`), and its score must be the higher the plainer
+        A pose must be good enough, near enough, and its score must be the higher the plainer
         the view is. Nor may a plain part be a figure on itself: print on a box can look like a smaller box, and then a
         nearer pose around it fits as well. Most pictures without the part are rejected after the first round.
 
@@ -191,7 +191,7 @@ class GuidedInit:
         return None if lines < PLAIN_LINES and self._has_rival(image, found) else found
 
     def is_near(self, cam_from_model: Array, guide_cam_from_model: Array) -> bool:
-        """Whether a pose (4,4) is within the limits of `GuidedInitOptions` around a given one (4,4)."""
+        """Whether a pose (4,4) is within the limits around a given one (4,4)."""
         center = apply(cam_from_model, self._center_in_model)
         wanted = apply(guide_cam_from_model, self._center_in_model)
         if center[2] <= 0:

@@ -124,7 +124,7 @@ class SearchBudget:
         scale_stride: spacing of the scale steps at which templates are matched.
         is_trimmed: leave out the quarter of each outline with the lowest responses, which may be occluded.
         use_edge_net: edge responses weigh as much as gradients until poses are ranked.
-        is_outer: search a wide range's outer sizes, see `GlobalSearchOptions.core_fill`, and nothing in other ranges.
+        is_outer: search a wide range's outer sizes, see `CORE_FILL`, and nothing in other ranges.
     """
 
     matches: int

@@ -438,7 +438,7 @@ class LocalSearch:
     def deduplicate(self, hypotheses: Iterable[Hypothesis], apart_deg: float, count: int = 1000) -> list[Hypothesis]:
         """The best ``count`` hypotheses, best first, without those close to a better one.
 
-        Of copies of one pose, closer than `LocalSearchOptions.distinct_deg`, the one with the best evidence stays.
+        Of copies of one pose, closer than `DISTINCT_DEG`, the one with the best evidence stays.
 
         Args:
             hypotheses: of one image.

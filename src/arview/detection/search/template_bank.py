@@ -73,7 +73,7 @@ class ViewOutlines:
         view_lines: (V,) distinct lines that the views show.
         groups: (V,) group of similar views, below `GROUPS`.
         near: nearest other directions.
-        far: directions on all sides at `OutlineOptions.far_deg`.
+        far: directions on all sides at `FAR_DEG`.
     """
 
     points: NDArray[np.float32]

@@ -30,7 +30,6 @@ MAX_HEADER_BYTES = 16_384
 class TimeLimitedProtocol(H11Protocol):
     """HTTP/1.1 with time limits for the headers of a request and for the reading of a response."""
 
-    limits = ConnectionLimits()
     on_lost: Callable[[], None] | None = None
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
@@ -193,7 +192,7 @@ class UvicornServer(uvicorn.Server):
         handshake[0].add_done_callback(self._handshakes.discard)
 
     async def _shake_hands(self, line: socket.socket, peer: Peer, protocol: TimeLimitedProtocol) -> None:
-        limits, tls = protocol.limits, self.config.ssl
+        tls = self.config.ssl
         try:
             await asyncio.get_running_loop().connect_accepted_socket(
                 lambda: protocol,

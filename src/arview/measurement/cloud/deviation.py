@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -70,11 +70,6 @@ REGISTRATION = RegistrationOptions(min_width_mm=0.1, threshold_mm=1e-3, threshol
 
 
 @dataclass(frozen=True)
-class CloudDeviationOptions:
-    """Options of measuring components in a cloud."""
-
-
-@dataclass(frozen=True)
 class CloudComponent:
     """A component with its surroundings, as it is measured in a cloud.
 
@@ -113,7 +108,6 @@ def measure_components_in_cloud(
     model: Model,
     part: Part,
     photos: Sequence[PosedPhoto] = (),
-    options: CloudDeviationOptions | None = None,
     names: Sequence[str] | None = None,
 ) -> list[Move | NotMeasured]:
     """Measure the moves of the components to be inspected, in the order of the model.
@@ -124,13 +118,11 @@ def measure_components_in_cloud(
         part: roles and symmetries.
         photos: with ``cam_from_scan`` in the same frame, for what is visible; without them everything counts as visible
             that does not touch another component.
-        options: see `CloudDeviationOptions`.
         names: components to measure; default: those to be inspected.
 
     Raises:
         InputError: the cloud is empty, far from the CAD, of another part, or mirrored.
     """
-    o = options or CloudDeviationOptions()
     box = model.bounds_in_model + np.array([[-BAND_MM], [BAND_MM]])
     points = prepare_cloud(cloud, box, GRID_MM, MIN_POINTS)
     check_belongs(points, model, BAND_MM)

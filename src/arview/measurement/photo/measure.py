@@ -61,7 +61,7 @@ def measure_components_in_photos(
         names = names or [name for name in part.inspected if name in known] if part is not None else names
     indices = [model.index(name) for name in names]
     results: dict[str, MethodResults] = {}
-    jobs = [(index, pool().submit(measure_component, views, index, part, options)) for index in indices]
+    jobs = [(index, pool().submit(measure_component, views, index, part)) for index in indices]
     for done, (index, job) in enumerate(jobs, 1):
         name = model.components[index].name
         results[name] = job.result()

@@ -26,7 +26,7 @@ class Agreement:
         turn_deg: angle of the difference of their rotations, along directions that both determine.
         mixed_ratio: length of the difference of shift and turn together in all directions that both determine, in units
             of their joint covariance, divided by that which 95 % of such differences do not exceed.
-        is_contradiction: whether that length is beyond what chance explains, see `CombineOptions`.
+        is_contradiction: whether that length is beyond what chance explains.
     """
 
     first: Method

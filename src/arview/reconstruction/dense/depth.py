@@ -82,7 +82,7 @@ def depth_maps(
             small = [_shrunk(grey, step) for grey in greys]
             search = partial(_search, views, small, maps, sparse, cad, options, stage, device)
             maps = _each(pool, search, len(views), f"depth maps {stage + 1} of {len(STEPS)}", progress)
-        return _each(pool, partial(_polished, views, greys, maps, options), len(views), "polishing", progress)
+        return _each(pool, partial(_polished, views, greys, maps), len(views), "polishing", progress)
 
 
 def _each(pool: ThreadPoolExecutor, job: Callable[[int], T], count: int, name: str, progress: Progress) -> list[T]:

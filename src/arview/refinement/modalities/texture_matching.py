@@ -17,7 +17,7 @@ from arview.rendering.raycast import Hierarchy, cast_ray
 
 
 class MatchSettings(NamedTuple):
-    """Options of the matching in the form of the kernels, see `TextureOptions`."""
+    """Options of the matching in the form of the kernels."""
 
     search_px: int
     check_occlusion: bool

@@ -16,6 +16,9 @@ from arview.cad.part import Part
 from arview.errors import InputError
 from arview.geometry import Array, apply, invert
 from arview.measurement.cloud.deviation import (
+    BAND_MM,
+    GRID_MM,
+    MIN_POINTS,
     CloudComponent,
     cloud_component,
     crop_component,
@@ -104,8 +107,8 @@ def placed_by_icp(
         options: of the classical ICP.
     """
     icp = options or ClassicalIcpOptions()
-    box = part.model.bounds_in_model + np.array([[-o.band_mm], [o.band_mm]])
-    points = prepare_cloud(cloud, box, o.grid_mm, o.min_points)
+    box = part.model.bounds_in_model + np.array([[-BAND_MM], [BAND_MM]])
+    points = prepare_cloud(cloud, box, GRID_MM, MIN_POINTS)
     with threadpool_limits(1, "blas"):
         return [
             _by_icp(found, cloud_component(found.component, part.model, part, None), points, icp)

@@ -53,13 +53,13 @@ def read_points(path: str | Path) -> RawPoints:
         raise InputError(f"{path}: is empty")
     for magic, read in ((b"ply", _read_ply), (b"LASF", _read_las), (b"ASTM-E57", _read_e57)):
         if start.startswith(magic):
-            return read(path, o)
+            return read(path)
     read_suffix = SUFFIXES.get(path.suffix.lower())
     if read_suffix is None:
         raise InputError(f"{path}: is no known format of a cloud; expected {', '.join(SUFFIXES)}")
     if read_suffix in (_read_ply, _read_las, _read_e57):
         raise InputError(f"{path}: is not a {path.suffix[1:].upper()} file with points")
-    return read_suffix(path, o)
+    return read_suffix(path)
 
 
 def _read_ply(path: Path) -> RawPoints:
@@ -216,7 +216,7 @@ def _integer(path: Path, word: str) -> int:
     return int(word)
 
 
-SUFFIXES: dict[str, Callable[[Path, ReadOptions], RawPoints]] = {
+SUFFIXES: dict[str, Callable[[Path], RawPoints]] = {
     ".ply": _read_ply,
     ".pcd": _read_pcd,
     ".xyz": read_text,
