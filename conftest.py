@@ -21,15 +21,15 @@ if IS_WORKER:
 
 ROOT = Path(__file__).parent
 TESTS = ROOT / "tests"
-TIMED_ROOMS = ("live", "browser")
+TIMED_ROOMS = ("station.live", "browser")
 """Their tests wait for servers, cameras and browsers: one worker takes them all, one after another."""
 MARKER_OF_ROOM = {"browser": "browser", "integration": "integration"}
 
 
 def room(item: pytest.Item) -> str:
-    """The folder of ``tests/`` that a test lies in; none for the tests of `tools/lab`."""
-    parts = item.path.relative_to(TESTS).parts if item.path.is_relative_to(TESTS) else ()
-    return parts[0] if len(parts) > 1 else ""
+    """The room that a test is of, by its folder in ``tests/``; none for the tests of `tools/lab`."""
+    parts = item.path.relative_to(TESTS).parts[:-1] if item.path.is_relative_to(TESTS) else ()
+    return ".".join(parts[: 2 if parts[:1] in (("station",), ("quality",)) else 1])
 
 
 def pytest_configure() -> None:

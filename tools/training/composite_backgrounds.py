@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from arview.core.atomic import replacing
 from arview.errors import InputError
 from arview.geometry import Array
-from arview.live.stream.frames import to_jpeg
+from arview.station.live.stream.frames import to_jpeg
 from arview.video import Image
 from arview_lab.semisynthetic import photos_in
 from arview_lab.semisynthetic.backgrounds import read_photo

@@ -13,7 +13,7 @@ from arview.cli.common import main, say
 from arview.cli.exit_codes import ExitCode, exit_code_of
 
 if TYPE_CHECKING:
-    from arview.workflow.batch import JobResult
+    from arview.quality.batch.run import JobResult
 
 
 @main.command(
@@ -82,12 +82,12 @@ def batch(
     """Inspect all parts that JOBS.toml names."""
     from tqdm import tqdm
 
-    from arview.workflow.batch import BatchOptions, run_batch
-    from arview.workflow.jobs_file import load_jobs
+    from arview.quality.batch.jobs_file import load_jobs
+    from arview.quality.batch.run import BatchOptions, run_batch
 
     jobs = load_jobs(jobs_path)
     if store is not None:
-        from arview.history import HistoryStore
+        from arview.quality.history import HistoryStore
 
         HistoryStore(store).close()
     options = BatchOptions(scheduler, workers or 0, memory_limit, retries, connect_s)
@@ -124,8 +124,8 @@ def _line(result: JobResult) -> str:
 
 def _add(results: list[JobResult], store: str, station: str | None) -> None:
     """Add the results to the store; those already there stay as they are."""
-    from arview.history import HistoryStore
-    from arview.workflow.storage import read
+    from arview.quality.batch.storage import read
+    from arview.quality.history import HistoryStore
 
     with HistoryStore(store) as opened, tempfile.TemporaryDirectory() as folder:
         new = 0

@@ -66,11 +66,11 @@ def export(
 ) -> None:
     """Write INSPECTION in other formats."""
     from arview.cad import load_part
-    from arview.decisions import decisions_csv, log_of
-    from arview.decisions.table import decided_cells
     from arview.inspection import load_inspection
     from arview.inspection.export import to_csv, to_dfq, to_glb, to_qif
     from arview.inspection.fingerprint import fingerprint_of_file
+    from arview.quality.decisions import decisions_csv, log_of
+    from arview.quality.decisions.table import decided_cells
 
     source = Path(inspection)
     targets = _targets(source, formats, output, part_path)
@@ -106,7 +106,7 @@ def export(
 
 def _targets(source: Path, formats: tuple[str, ...], output: str | None, part_path: str | None) -> dict[str, Path]:
     """The file of each format; a folder that is not there is made where the name ends in / or has no ending."""
-    from arview.decisions import log_of
+    from arview.quality.decisions import log_of
 
     inputs = [source, part_path]
     folder = source.parent if output is None else Path(output)

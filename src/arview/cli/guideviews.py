@@ -134,8 +134,8 @@ def studio(part: str, port: int, others: tuple[str, ...], unit: str | None, no_b
 
     require_extra()
     from arview.cad import load_part
-    from arview.studio.document import StudioDocument
-    from arview.studio.server import StudioServer
+    from arview.station.studio.document import StudioDocument
+    from arview.station.studio.server import StudioServer
 
     server = StudioServer(StudioDocument(part, unit), port, [load_part(other, unit) for other in others])
 

@@ -16,8 +16,8 @@ from arview.core.atomic import write_file
 from arview.errors import ArviewError, InputError
 
 if TYPE_CHECKING:
-    from arview.decisions import Decision, RecordState
-    from arview.history import Capability, ComponentSeries, ControlChart, HistoryStore, StoredResult
+    from arview.quality.decisions import Decision, RecordState
+    from arview.quality.history import Capability, ComponentSeries, ControlChart, HistoryStore, StoredResult
 
 _SHOWN_CHANGES = 8
 _QUANTITIES = ("distance", "dx", "dy", "dz", "tilt", "twist")
@@ -251,8 +251,8 @@ def chart(
     output: str | None, zone: tzinfo, part: str | None, station: str | None, since: str | None, store: str | None,
 ) -> None:  # fmt: skip
     """Show the trend of a component over the parts, with control limits, Cp and Cpk."""
-    from arview.history import Capability, capability_by_limits, control_chart, series_of
-    from arview.history.chart import FORMATS, draw
+    from arview.quality.history import Capability, capability_by_limits, control_chart, series_of
+    from arview.quality.history.chart import FORMATS, draw
 
     target = None if output is None else output_path(output, [])
     if target is not None and target.suffix.lstrip(".").lower() not in FORMATS:
@@ -303,7 +303,7 @@ def _print_capability(
     ability: Capability | InputError, series: ComponentSeries, limits: tuple[float | None, float | None] | None
 ) -> None:
     """Print the indices of the values with these limits; of all values with None."""
-    from arview.history.series import limits_text
+    from arview.quality.history.series import limits_text
 
     lead = ""
     if limits is not None:
@@ -340,7 +340,7 @@ def export(
     store: str | None,
 ) -> None:  # fmt: skip
     """Write results to a file; its times are UTC."""
-    from arview.history.export import to_csv, to_json_lines
+    from arview.quality.history.export import to_csv, to_json_lines
 
     target = output_path(output, [])
     kind = target.suffix.lower()
@@ -391,7 +391,7 @@ def list_decisions(
     store: str | None,
 ) -> None:  # fmt: skip
     """List the decisions, ticks and signatures about the results."""
-    from arview.decisions import decisions_csv
+    from arview.quality.decisions import decisions_csv
 
     target = None if output is None else output_path(output, [])
     with _open(store, must_exist=True) as opened:
@@ -409,7 +409,7 @@ def list_decisions(
 
 
 def _print_decisions(rows: Sequence[tuple[StoredResult, Decision]], zone: tzinfo) -> None:
-    from arview.decisions.table import decision_word
+    from arview.quality.decisions.table import decision_word
 
     cells: list[tuple[str, ...]] = []
     for result, one in rows:
@@ -443,7 +443,7 @@ def _decided_word(state: RecordState | None) -> str:
 
 
 def _open(store: str | None, must_exist: bool = False) -> HistoryStore:
-    from arview.history.store import HistoryStore, default_store
+    from arview.quality.history.store import HistoryStore, default_store
 
     return HistoryStore(store or default_store(), must_exist)
 

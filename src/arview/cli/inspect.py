@@ -130,14 +130,14 @@ def inspect(
         guard, max_frames, seed, threads, device, not no_pdf, not no_repeatability, pairs,
     )  # fmt: skip
     if store is not None:
-        from arview.history import HistoryStore
+        from arview.quality.history import HistoryStore
 
         HistoryStore(store).close()  # a store that cannot be used is reported now, not after the measurement
     with line_bar(video is not None, photos is None, not no_pdf) as progress:
         outcome = inspect_part(job, output, progress=progress, starts_over=force)
     print_outcome(outcome)
     if store is not None:
-        from arview.history import HistoryStore
+        from arview.quality.history import HistoryStore
 
         with HistoryStore(store) as opened:
             added = opened.add(outcome.folder / "inspection.json", station)

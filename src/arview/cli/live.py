@@ -21,9 +21,9 @@ from arview.cli.exit_codes import ExitCode
 from arview.errors import InputError, MissingDependencyError
 
 if TYPE_CHECKING:
-    from arview.live.server.hub import Hub
-    from arview.live.server.live_server import LiveServer
-    from arview.live.stream.subjects import Subjects
+    from arview.station.live.server.hub import Hub
+    from arview.station.live.server.live_server import LiveServer
+    from arview.station.live.stream.subjects import Subjects
 
 STOP_DEADLINE_S = 4.6
 """Time from a signal to the end of the program, whatever its workers do."""
@@ -69,7 +69,7 @@ def _keep_device_option(ctx: click.Context, parameter: click.Parameter, value: b
 
 def _list_devices() -> None:
     """Print the paired devices."""
-    from arview.live.security.devices import devices_path, read_devices
+    from arview.station.live.security.devices import devices_path, read_devices
 
     devices = read_devices(devices_path())
     width = max((len(one.name) for one in devices), default=0)
@@ -81,7 +81,7 @@ def _list_devices() -> None:
 
 def _revoke_devices(names: tuple[str, ...]) -> None:
     """Forget paired devices. Raises InputError for a name that none has."""
-    from arview.live.security.devices import Devices, devices_path
+    from arview.station.live.security.devices import Devices, devices_path
 
     devices = Devices(devices_path())
     for name in dict.fromkeys(names):
@@ -223,9 +223,9 @@ def live(
     import asyncio
 
     require_extra()
-    from arview.live.options import JobOptions, LiveOptions, RecordingOptions
-    from arview.live.security.devices import devices_path
-    from arview.live.server.live_server import LiveServer, open_endpoint
+    from arview.station.live.options import JobOptions, LiveOptions, RecordingOptions
+    from arview.station.live.security.devices import devices_path
+    from arview.station.live.server.live_server import LiveServer, open_endpoint
 
     check_profile(profile, camera_spec)
     _check_inputs(part_paths, source)
@@ -259,7 +259,7 @@ def live(
     _tell_logs()
     server = LiveServer(options, open_endpoint(host, port, is_plain, cert, key))
     from arview.guideviews import GuideViewOptions
-    from arview.live.server.loading import load_subjects
+    from arview.station.live.server.loading import load_subjects
 
     def load() -> Subjects:
         with progress_bar("guide views") as progress:
@@ -354,7 +354,7 @@ def require_extra() -> None:
 
 
 async def _serve(server: LiveServer, load: Callable[[], Subjects]) -> None:
-    from arview.live.server.loading import warm_up
+    from arview.station.live.server.loading import warm_up
 
     def ready(hub: Hub) -> None:
         gc.collect()
@@ -373,7 +373,7 @@ def _print_welcome(server: LiveServer) -> None:
     certificates = endpoint.certificates
     click.echo(f"page:  {server.link}")
     if endpoint.trust_link is not None and certificates is not None and certificates.authority_der is not None:
-        from arview.live.security.trust_page import fingerprint
+        from arview.station.live.security.trust_page import fingerprint
 
         click.echo(f"first time on a phone:  {endpoint.trust_link}")
         click.echo(f"fingerprint:  {fingerprint(certificates.authority_der)}")
@@ -406,7 +406,7 @@ def _tell_logs() -> None:
                 text += f": {type(record.exc_info[1]).__name__}: {record.exc_info[1]}"
             say(f"{record.levelname.lower()}: {text}")
 
-    logger = logging.getLogger("arview.live")
+    logger = logging.getLogger("arview.station.live")
     logger.addHandler(Lines())
     logger.setLevel(logging.INFO)
     logger.propagate = False

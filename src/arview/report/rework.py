@@ -10,8 +10,8 @@ from typing import Any
 from markupsafe import Markup
 
 from arview.cad.part import Part
+from arview.quality.rework import drawing_svg, instructions
 from arview.report.evidence import ReportEvidence
-from arview.rework import drawing_svg, instructions
 
 _HOW = {
     "install": "install", "adjust": "adjust", "unbolt": "unbolt and move", "reweld": "weld again",
