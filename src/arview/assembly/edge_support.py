@@ -185,9 +185,13 @@ class EdgeSupportMeter:
         projection = Projection(cam_from_body, intrinsics, 0.01 * self._diameter_mm)
         self._measured = picture, projection
         all_points, unshared = measure_edge_support(
-            picture, edges, none if is_absent is None else is_absent, projection, self._shifts(px_per_mm),
+            picture,
+            edges,
+            none if is_absent is None else is_absent,
+            projection,
+            self._shifts(px_per_mm),
             POINTS,
-        )  # fmt: skip
+        )
         return MeasuredSupport(EdgeSupport(*all_points), EdgeSupport(*unshared))
 
     def found_points(self, edges: VisibleEdges, is_wanted: NDArray[np.bool_]) -> FoundPoints:
@@ -249,9 +253,16 @@ def _disc(inner_px: float, outer_px: float, step: int) -> NDArray[np.int64]:
 
 @kernel
 def _best_shift(
-    picture: EdgePicture, c: int, places: NDArray[np.int64], along: NDArray[np.int64], count: int,
-    scores: NDArray[np.float64], shifts: NDArray[np.int64], costs: NDArray[np.float64], lowest: int
-) -> float:  # fmt: skip
+    picture: EdgePicture,
+    c: int,
+    places: NDArray[np.int64],
+    along: NDArray[np.int64],
+    count: int,
+    scores: NDArray[np.float64],
+    shifts: NDArray[np.int64],
+    costs: NDArray[np.float64],
+    lowest: int,
+) -> float:
     """Share of ``count`` points on edges at the best shift, by the sum of scores less its cost.
 
     Args:
@@ -281,9 +292,13 @@ def _best_shift(
 
 @kernel
 def _contrast(
-    image: NDArray[np.uint8], edges: VisibleEdges, is_own: NDArray[np.bool_], projected: _Projected, c: int,
-    reach_px: float
-) -> float:  # fmt: skip
+    image: NDArray[np.uint8],
+    edges: VisibleEdges,
+    is_own: NDArray[np.bool_],
+    projected: _Projected,
+    c: int,
+    reach_px: float,
+) -> float:
     """Mean colour change across a component's outline in standard deviations, over runs of points; -1 without runs."""
     pixels, normals, depths = projected.pixels, projected.normals, projected.depths
     sides = edges.sides
@@ -341,9 +356,13 @@ def _unshared_points(edges: VisibleEdges, projected: _Projected, owners: NDArray
 
 @kernel
 def _usable_points(
-    edges: VisibleEdges, is_own: NDArray[np.bool_], projected: _Projected, c: int, shape: tuple[int, int],
-    usable: NDArray[np.int64]
-) -> tuple[int, float]:  # fmt: skip
+    edges: VisibleEdges,
+    is_own: NDArray[np.bool_],
+    projected: _Projected,
+    c: int,
+    shape: tuple[int, int],
+    usable: NDArray[np.int64],
+) -> tuple[int, float]:
     """Own points (N,) of a component inside the picture: sets their indices in ``usable``.
 
     Returns:
@@ -373,7 +392,7 @@ def _usable_points(
 @kernel
 def _place_points(
     projected: _Projected, usable: NDArray[np.int64], places: NDArray[np.int64], along: NDArray[np.int64]
-) -> int:  # fmt: skip
+) -> int:
     """Choose evenly spread points of those usable: sets their pixels and normals, see `_best_shift`.
 
     Returns:
@@ -394,9 +413,13 @@ def _place_points(
 
 @kernel
 def measure_edge_support(
-    picture: EdgePicture, edges: VisibleEdges, is_absent: NDArray[np.bool_], projection: Projection, shifts: Shifts,
-    limits: PointLimits
-) -> MeasuredSupport:  # fmt: skip
+    picture: EdgePicture,
+    edges: VisibleEdges,
+    is_absent: NDArray[np.bool_],
+    projection: Projection,
+    shifts: Shifts,
+    limits: PointLimits,
+) -> MeasuredSupport:
     """`MeasuredSupport` of all components.
 
     Args:
@@ -411,10 +434,14 @@ def measure_edge_support(
     count = edges.starts.shape[0] - 1
     projected = _Projected(
         *project_lines(
-            edges.points_in_body, edges.tangents, True, projection.cam_from_body, projection.intrinsics,
+            edges.points_in_body,
+            edges.tangents,
+            True,
+            projection.cam_from_body,
+            projection.intrinsics,
             projection.step_mm,
         )
-    )  # fmt: skip
+    )
     pixels = projected.pixels
     find_thin_edges(picture, limits.min_slope)
     found = np.full((8, count), -1.0)

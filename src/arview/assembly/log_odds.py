@@ -21,11 +21,30 @@ from arview.geometry import Array
 from arview.weights import load_weights
 
 FEATURES = (
-    "constant", "supported", "lead", "contrast", "determined", "determined_supported", "determined_lead",
-    "network_against", "network_for", "is_predicted", "bare", "is_bare_known", "bare_unsupported", "ring",
-    "is_ring_known", "around", "is_around_known", "base",
-    "behind", "is_behind_known", "bare_around", "against_around", "against_unsupported",
-)  # fmt: skip
+    "constant",
+    "supported",
+    "lead",
+    "contrast",
+    "determined",
+    "determined_supported",
+    "determined_lead",
+    "network_against",
+    "network_for",
+    "is_predicted",
+    "bare",
+    "is_bare_known",
+    "bare_unsupported",
+    "ring",
+    "is_ring_known",
+    "around",
+    "is_around_known",
+    "base",
+    "behind",
+    "is_behind_known",
+    "bare_around",
+    "against_around",
+    "against_unsupported",
+)
 """Inputs of the model of places, in order; see `evidence_features`."""
 
 
@@ -163,11 +182,28 @@ def evidence_features(evidence: Evidence) -> Array:
     is_behind, around = places.behind >= 0.0, np.where(is_around, places.around, 0.0)
     bare = np.where(is_bare, places.bare * places.coverage, 0.0)
     columns = [
-        np.ones(len(network)), support.supported, lead, contrast / MAX_CONTRAST, reliable,
-        reliable * support.supported, reliable * lead, np.maximum(predicted, 0.0), np.minimum(predicted, 0.0),
-        is_predicted, bare, np.where(is_bare, places.coverage, 0.0), bare * (1.0 - support.supported),
-        np.where(is_ring, places.ring, 0.0), is_ring, around, is_around,
-        np.full(len(network), base), np.where(is_behind, places.behind, 0.0), is_behind, bare * around,
-        np.maximum(predicted, 0.0) * around, np.maximum(predicted, 0.0) * (1.0 - support.supported),
-    ]  # fmt: skip
+        np.ones(len(network)),
+        support.supported,
+        lead,
+        contrast / MAX_CONTRAST,
+        reliable,
+        reliable * support.supported,
+        reliable * lead,
+        np.maximum(predicted, 0.0),
+        np.minimum(predicted, 0.0),
+        is_predicted,
+        bare,
+        np.where(is_bare, places.coverage, 0.0),
+        bare * (1.0 - support.supported),
+        np.where(is_ring, places.ring, 0.0),
+        is_ring,
+        around,
+        is_around,
+        np.full(len(network), base),
+        np.where(is_behind, places.behind, 0.0),
+        is_behind,
+        bare * around,
+        np.maximum(predicted, 0.0) * around,
+        np.maximum(predicted, 0.0) * (1.0 - support.supported),
+    ]
     return np.stack([np.asarray(column, dtype=np.float64) for column in columns], axis=1)

@@ -182,9 +182,15 @@ class ComponentObserver:
         points = self._meter.found_points(edges, is_trusted)
         is_doubtful[self.base] = False
         places = self._places.measure(
-            crop.image, crop.cam_from_body, crop.intrinsics, is_doubtful, is_trusted, known.is_absent, points,
+            crop.image,
+            crop.cam_from_body,
+            crop.intrinsics,
+            is_doubtful,
+            is_trusted,
+            known.is_absent,
+            points,
             self._meter.found_behind(self._base_edges.nearest(cam_from_model), points.shift),
-        )  # fmt: skip
+        )
         network, picture = np.full(self._count, np.nan), None
         if (is_doubtful | known.is_searched).any():
             picture = PartImage(crop.image, self._edge_net.predict(crop.image), crop.intrinsics, crop.cam_from_body)

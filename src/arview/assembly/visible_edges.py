@@ -147,9 +147,11 @@ class VisibleEdgeCache:
         drawn = renderer.render(view_pose)
         is_kept = ~is_absent[mesh.component]
         left = mesh._replace(
-            ends=mesh.ends[is_kept], faces=mesh.faces[is_kept], is_sharp=mesh.is_sharp[is_kept],
+            ends=mesh.ends[is_kept],
+            faces=mesh.faces[is_kept],
+            is_sharp=mesh.is_sharp[is_kept],
             component=mesh.component[is_kept],
-        )  # fmt: skip
+        )
         found = self._sampled(view_pose, replace(drawn, component_ids=names[drawn.component_ids]), left)
         is_own = is_absent[complete.component]
         component = np.concatenate([found.component, complete.component[is_own]])
@@ -288,7 +290,7 @@ def _sample_edges(mesh: _Mesh, view: _Rendering) -> _Samples:
 @kernel
 def _own_samples(
     samples: _Samples, view: _Rendering, shared_px: float, shared_cos: float, occluder_px: int
-) -> NDArray[np.bool_]:  # fmt: skip
+) -> NDArray[np.bool_]:
     """(N,) False for samples near a parallel edge of another component, or near a surface in front of them.
 
     The limits are the constants of this module.

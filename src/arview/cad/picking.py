@@ -212,9 +212,15 @@ def _outward(component: Component, rim: RoundEdge) -> Array:
 
 
 def _edge(
-    vertices: Array, faces: NDArray[np.int64], neighbours: NDArray[np.int64], normals: Array, flat: NDArray[np.int64],
-    point: Array, reach_mm: float, sharp_deg: float,
-) -> PickedFeature | None:  # fmt: skip
+    vertices: Array,
+    faces: NDArray[np.int64],
+    neighbours: NDArray[np.int64],
+    normals: Array,
+    flat: NDArray[np.int64],
+    point: Array,
+    reach_mm: float,
+    sharp_deg: float,
+) -> PickedFeature | None:
     """The straight sharp edge of the picked face that is nearest to the point, if it is near enough."""
     beyond = neighbours[flat]
     cosine = np.einsum("fkj,fj->fk", normals[beyond], normals[flat])

@@ -43,8 +43,11 @@ class LensComparison:
 
 
 def compare_lenses(
-    views: Sequence[BoardView], width: int, height: int, used: CalibratedLens,
-) -> LensComparison:  # fmt: skip
+    views: Sequence[BoardView],
+    width: int,
+    height: int,
+    used: CalibratedLens,
+) -> LensComparison:
     """Compare the lens model in use with the other one, on all views and without leaving out corners.
 
     Args:

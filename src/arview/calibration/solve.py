@@ -220,10 +220,12 @@ def _adjust_brown(views: Sequence[BoardView], width: int, height: int, start: Ca
         found = Camera(width, height, fx, fy, cx, cy, np.ravel(d)[:5])
     except (cv2.error, ValueError) as error:
         raise InputError("OpenCV finds no camera") from error
-    poses = np.array([
-        rigid(cv2.Rodrigues(np.asarray(turn))[0], np.asarray(shift).ravel())
-        for turn, shift in zip(turns, shifts, strict=True)
-    ])  # fmt: skip
+    poses = np.array(
+        [
+            rigid(cv2.Rodrigues(np.asarray(turn))[0], np.asarray(shift).ravel())
+            for turn, shift in zip(turns, shifts, strict=True)
+        ]
+    )
     return found, poses
 
 

@@ -99,13 +99,15 @@ def assess(solution: Solution) -> CalibrationVerdict:
         _grade(-coverage, -GOOD_COVERAGE, -USABLE_COVERAGE),
     ]
     reasons = [
-        f"the focal length is known to ± {100 * focal_u:.2f} % only" if np.isfinite(focal_u)
+        f"the focal length is known to ± {100 * focal_u:.2f} % only"
+        if np.isfinite(focal_u)
         else "the views do not determine the focal length",
-        f"a ray at the worst place of the picture is known to ± {worst:.2f} px only" if np.isfinite(worst)
+        f"a ray at the worst place of the picture is known to ± {worst:.2f} px only"
+        if np.isfinite(worst)
         else "the views do not determine where rays are seen",
         f"the corners scatter by {solution.rms_px:.2f} px",
         f"corners of the board were seen in only {100 * coverage:.0f} % of the picture",
-    ]  # fmt: skip
+    ]
     why = [reason for reason, grade in zip(reasons, grades, strict=True) if grade is not Grade.GOOD]
     order = list(Grade)
     grade = max(grades, key=order.index)
@@ -130,9 +132,17 @@ def assess(solution: Solution) -> CalibrationVerdict:
         if not advice:
             advice.append("take more views, tilted to all sides, with the board filling the picture")
     return CalibrationVerdict(
-        grade, focal_u, centre_u, (float(np.nanmedian(pixel_u)), worst), coverage, cells,
-        (float(tilts.min()), float(np.median(tilts)), float(tilts.max())), ratio, tuple(why), tuple(advice),
-    )  # fmt: skip
+        grade,
+        focal_u,
+        centre_u,
+        (float(np.nanmedian(pixel_u)), worst),
+        coverage,
+        cells,
+        (float(tilts.min()), float(np.median(tilts)), float(tilts.max())),
+        ratio,
+        tuple(why),
+        tuple(advice),
+    )
 
 
 def _grade(value: float, good: float, usable: float) -> Grade:
@@ -159,10 +169,12 @@ def _cells(solution: Solution) -> Array:
 
 def _attitudes(solution: Solution, tilted_deg: float) -> tuple[Array, int, Array]:
     """Tilt of each view in degrees, number of sides (of four) to which tilted views lean, and distances in mm."""
-    middles = np.array([
-        pose[:3, :3] @ view.points_in_board.mean(axis=0) + pose[:3, 3]
-        for view, pose in zip(solution.views, solution.cams_from_board, strict=True)
-    ])  # fmt: skip
+    middles = np.array(
+        [
+            pose[:3, :3] @ view.points_in_board.mean(axis=0) + pose[:3, 3]
+            for view, pose in zip(solution.views, solution.cams_from_board, strict=True)
+        ]
+    )
     normals = solution.cams_from_board[:, :3, 2]
     # A board parallel to the picture plane does not determine the focal length, wherever it is seen.
     tilts = np.degrees(np.arccos(np.clip(np.abs(normals[:, 2]), 0.0, 1.0)))
@@ -173,6 +185,9 @@ def _attitudes(solution: Solution, tilted_deg: float) -> tuple[Array, int, Array
 def _empty_corners(cells: Array) -> list[str]:
     """Names of the picture's corners without a corner of the board."""
     names = {
-        "upper left": (0, 0), "upper right": (0, -1), "lower left": (-1, 0), "lower right": (-1, -1),
-    }  # fmt: skip
+        "upper left": (0, 0),
+        "upper right": (0, -1),
+        "lower left": (-1, 0),
+        "lower right": (-1, -1),
+    }
     return [name for name, place in names.items() if cells[place] == 0]

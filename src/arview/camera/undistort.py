@@ -53,9 +53,12 @@ def brown_camera(camera: Camera) -> Camera | None:
     xd, yd = camera.lens.distort(x, y)
     r2 = x * x + y * y
     columns = [
-        (x * r2, y * r2), (x * r2**2, y * r2**2), (2 * x * y, r2 + 2 * y * y), (r2 + 2 * x * x, 2 * x * y),
+        (x * r2, y * r2),
+        (x * r2**2, y * r2**2),
+        (2 * x * y, r2 + 2 * y * y),
+        (r2 + 2 * x * x, 2 * x * y),
         (x * r2**3, y * r2**3),
-    ]  # fmt: skip
+    ]
     matrix = np.stack([np.concatenate(column) for column in columns], axis=1)
     scale = np.abs(matrix).max(axis=0)
     terms = np.linalg.lstsq(matrix / scale, np.concatenate([xd - x, yd - y]), rcond=None)[0] / scale

@@ -48,8 +48,14 @@ inspection that report and results store show. The fields of inspection.json are
 src/arview/inspection/schema/inspection-json.md and by the JSON Schema next to it.""",
 )
 @click.argument("inspection", metavar="INSPECTION")
-@click.option("--to", "formats", callback=_parse_formats, required=True, metavar="LIST",
-              help="csv, qif, dfq, glb, html, pdf, decisions, separated by commas.")  # fmt: skip
+@click.option(
+    "--to",
+    "formats",
+    callback=_parse_formats,
+    required=True,
+    metavar="LIST",
+    help="csv, qif, dfq, glb, html, pdf, decisions, separated by commas.",
+)
 @click.option("-o", "--output", metavar="FILE|FOLDER", help="File to write, or folder; default: next to INSPECTION.")
 @click.option("--part", "part_path", metavar="PART", help="Part file or CAD file, for glb, html and pdf.")
 @click.option("--folder", metavar="OUT", help="Folder of `arview reconstruct`, for html and pdf.")

@@ -118,8 +118,9 @@ the commands check, guideviews and annotate.""",
 @click.option(
     "--port", type=click.IntRange(0, 65535), default=8460, show_default=True, help="Port of the page; 0: any."
 )
-@click.option("--against", "others", multiple=True, metavar="PART",
-              help="Another part it might be taken for; may be repeated.")  # fmt: skip
+@click.option(
+    "--against", "others", multiple=True, metavar="PART", help="Another part it might be taken for; may be repeated."
+)
 @UNIT
 @click.option("--no-browser", is_flag=True, help="Print the address, open no browser.")
 def studio(part: str, port: int, others: tuple[str, ...], unit: str | None, no_browser: bool) -> None:

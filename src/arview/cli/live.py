@@ -149,12 +149,23 @@ the folder reach --quota or the disk is almost full. Ctrl-C ends the run and fin
 seconds.""",
     exit_codes={ExitCode.INTERRUPTED: "ended by Ctrl-C; files are finished"},
 )
-@click.option("--part", "part_paths", required=True, multiple=True, metavar="PART",
-              help="Part file or CAD file; again for further parts.")  # fmt: skip
+@click.option(
+    "--part",
+    "part_paths",
+    required=True,
+    multiple=True,
+    metavar="PART",
+    help="Part file or CAD file; again for further parts.",
+)
 @click.option("--instances", type=click.IntRange(1, 16), default=1, metavar="N", help="Specimens of each part in view.")
 @click.option("--guideviews", "views_path", metavar="SET", help="Guide views; default: rendered and cached.")
-@click.option("--inspection", "inspection_paths", multiple=True, metavar="FILE",
-              help="inspection.json whose values are shown; again for further specimens, in their order.")  # fmt: skip
+@click.option(
+    "--inspection",
+    "inspection_paths",
+    multiple=True,
+    metavar="FILE",
+    help="inspection.json whose values are shown; again for further specimens, in their order.",
+)
 @click.option(
     "--source", default="phone", show_default=True, metavar="SOURCE", help="Camera or video to show; see below."
 )
@@ -165,29 +176,74 @@ seconds.""",
 @click.option(
     "--host", metavar="ADDRESS", help="Address to listen at; default: the one in the local network. 0.0.0.0: all."
 )
-@click.option("--port", type=click.IntRange(0, 65534), default=8443, show_default=True,
-              help="Port of the pages; the page about the certificate gets the next one.")  # fmt: skip
+@click.option(
+    "--port",
+    type=click.IntRange(0, 65534),
+    default=8443,
+    show_default=True,
+    help="Port of the pages; the page about the certificate gets the next one.",
+)
 @click.option("--http", "is_plain", is_flag=True, help="Plain HTTP for a browser on this machine.")
 @click.option("--cert", metavar="PEM", type=click.Path(path_type=Path), help="Your own certificate chain.")
 @click.option("--key", metavar="PEM", type=click.Path(path_type=Path), help="Key of that certificate.")
-@click.option("--clients", type=click.IntRange(1, 64), metavar="N",
-              help="Most pages at once; default: 2 phones, or 8 pages of a station camera.")  # fmt: skip
+@click.option(
+    "--clients",
+    type=click.IntRange(1, 64),
+    metavar="N",
+    help="Most pages at once; default: 2 phones, or 8 pages of a station camera.",
+)
 @click.option("--record", metavar="OUT.mp4", help="Record from the start; the video of a second phone is OUT-2.mp4.")
-@click.option("--quota", type=click.FloatRange(0, min_open=True), default=20.0, show_default=True, metavar="GB",
-              help="Largest size of all recordings in their folder.")  # fmt: skip
+@click.option(
+    "--quota",
+    type=click.FloatRange(0, min_open=True),
+    default=20.0,
+    show_default=True,
+    metavar="GB",
+    help="Largest size of all recordings in their folder.",
+)
 @click.option("--serial", metavar="TEXT", help="Serial number of the part in view; default: that of the part file.")
-@click.option("--max-age", callback=_parse_age, default="24h", show_default=True, metavar="AGE",
-              help="Age from which an inspection is called old: 8h, 3d, 90min, never.")  # fmt: skip
-@click.option("--jobs", "jobs", metavar="FOLDER", type=click.Path(file_okay=False),
-              default="arview_jobs", show_default=True,
-              help="Folder of the inspections that pages start; it is made with the first one.")  # fmt: skip
-@click.option("--devices", is_flag=True, is_eager=True, expose_value=False, callback=_keep_device_option,
-              help="List the paired phones and screens, and exit.")  # fmt: skip
-@click.option("--revoke", metavar="NAME", multiple=True, is_eager=True, expose_value=False,
-              callback=_keep_device_option,
-              help="Forget a paired device, of a running station too, and exit; may be given again.")  # fmt: skip
-@click.option("--size", callback=_parse_size, default="1280x720", show_default=True, metavar="WxH",
-              help="Size of the phone's pictures in landscape.")  # fmt: skip
+@click.option(
+    "--max-age",
+    callback=_parse_age,
+    default="24h",
+    show_default=True,
+    metavar="AGE",
+    help="Age from which an inspection is called old: 8h, 3d, 90min, never.",
+)
+@click.option(
+    "--jobs",
+    "jobs",
+    metavar="FOLDER",
+    type=click.Path(file_okay=False),
+    default="arview_jobs",
+    show_default=True,
+    help="Folder of the inspections that pages start; it is made with the first one.",
+)
+@click.option(
+    "--devices",
+    is_flag=True,
+    is_eager=True,
+    expose_value=False,
+    callback=_keep_device_option,
+    help="List the paired phones and screens, and exit.",
+)
+@click.option(
+    "--revoke",
+    metavar="NAME",
+    multiple=True,
+    is_eager=True,
+    expose_value=False,
+    callback=_keep_device_option,
+    help="Forget a paired device, of a running station too, and exit; may be given again.",
+)
+@click.option(
+    "--size",
+    callback=_parse_size,
+    default="1280x720",
+    show_default=True,
+    metavar="WxH",
+    help="Size of the phone's pictures in landscape.",
+)
 @click.option("--fps", type=float, default=30.0, show_default=True, help="Frame rate of the phone's pictures.")
 @RENDERER
 @UNIT

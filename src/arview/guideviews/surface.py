@@ -51,9 +51,14 @@ def surface_about(
 
 @kernel
 def draw_surface(
-    surface: Surface, pose: NDArray[np.float64], focal_px: NDArray[np.float64], center_px: NDArray[np.float64],
-    diameter_mm: float, drawn: NDArray[np.float32], face_ids: NDArray[np.int32]
-) -> None:  # fmt: skip
+    surface: Surface,
+    pose: NDArray[np.float64],
+    focal_px: NDArray[np.float64],
+    center_px: NDArray[np.float64],
+    diameter_mm: float,
+    drawn: NDArray[np.float32],
+    face_ids: NDArray[np.int32],
+) -> None:
     """Draw normals and depth of a surface in the view of an ideal camera.
 
     Args:

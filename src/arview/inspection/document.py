@@ -100,9 +100,12 @@ def to_document(inspection: Inspection) -> dict[str, Any]:
     source = inspection.provenance
     software, options = dict(source.software), dict(source.options)
     more: dict[str, Any] = {
-        "photos_hash": source.photos_hash, "photos": source.photos, "software": software, "options": options,
+        "photos_hash": source.photos_hash,
+        "photos": source.photos,
+        "software": software,
+        "options": options,
         "cpu_s": source.cpu_s,
-    }  # fmt: skip
+    }
     document: dict[str, Any] = {
         "schema_version": SCHEMA_VERSION,
         "part": inspection.part,

@@ -51,9 +51,12 @@ ROUGH_STD_MM = 0.3
 
 
 def measure(
-    reconstruction: MetricReconstruction | str | Path, part: Part, options: MeasureOptions | None = None,
-    *, progress: Progress | None = None,
-) -> Inspection:  # fmt: skip
+    reconstruction: MetricReconstruction | str | Path,
+    part: Part,
+    options: MeasureOptions | None = None,
+    *,
+    progress: Progress | None = None,
+) -> Inspection:
     """Measure every inspected component in the datum frame, with its uncertainty and verdict.
 
     Args:
@@ -75,9 +78,7 @@ def measure(
         return _measure(reconstruction, part, options or MeasureOptions(), progress or (lambda what, done, total: None))
 
 
-def _measure(
-    reconstruction: MetricReconstruction, part: Part, options: MeasureOptions, tell: Progress
-) -> Inspection:  # fmt: skip
+def _measure(reconstruction: MetricReconstruction, part: Part, options: MeasureOptions, tell: Progress) -> Inspection:
     """The steps of `measure`, on the rough frame of the reconstruction."""
     began = time.process_time()
     warnings = list(reconstruction.scale.warnings)
@@ -136,9 +137,13 @@ def _measure(
 
 
 def measure_all(
-    reconstruction: MetricReconstruction, views: PhotoViews | None, part: Part, names: Sequence[str],
-    options: MeasureOptions, tell: Progress,
-) -> dict[str, ComponentMeasurement]:  # fmt: skip
+    reconstruction: MetricReconstruction,
+    views: PhotoViews | None,
+    part: Part,
+    names: Sequence[str],
+    options: MeasureOptions,
+    tell: Progress,
+) -> dict[str, ComponentMeasurement]:
     """Measure every component by every requested method, in the rough frame."""
     found: dict[str, list[Move | NotMeasured]] = {name: [] for name in names}
     if views is not None and {"sweep", "edges"} & set(options.methods):
@@ -181,9 +186,12 @@ def measure_all(
 
 
 def align_to_datums(
-    reconstruction: MetricReconstruction, views: PhotoViews | None, part: Part, base: Sequence[str],
+    reconstruction: MetricReconstruction,
+    views: PhotoViews | None,
+    part: Part,
+    base: Sequence[str],
     results: Mapping[str, ComponentMeasurement],
-) -> tuple[Alignment, tuple[FailedDatum, ...]]:  # fmt: skip
+) -> tuple[Alignment, tuple[FailedDatum, ...]]:
     """The datum frame of the part file, and the datums that could not be measured.
 
     What they leave free follows from the base's fit, as does all without datums.
@@ -196,8 +204,11 @@ def align_to_datums(
     fits = {name: _rest_of_base(results[name], fitted[name], part) for name in base if name in fitted}
     rest = next(iter(fits.values()), None)
     found = measure_each(
-        part.datums, _datum_measurement(reconstruction, views, part, fitted), part.model, rest,
-    )  # fmt: skip
+        part.datums,
+        _datum_measurement(reconstruction, views, part, fitted),
+        part.model,
+        rest,
+    )
     equations = found.equations
     if not part.datums and views is not None:
         equations = _plane_of_base(views, part.model, base)
@@ -222,8 +233,11 @@ def align_to_datums(
 
 
 def _datum_measurement(
-    reconstruction: MetricReconstruction, views: PhotoViews | None, part: Part, fitted: Mapping[str, Move],
-) -> MeasureDatum:  # fmt: skip
+    reconstruction: MetricReconstruction,
+    views: PhotoViews | None,
+    part: Part,
+    fitted: Mapping[str, Move],
+) -> MeasureDatum:
     """The function that measures one datum, in the photos or in the cloud."""
 
     def measure_one(datum: Datum) -> DatumEquations:
@@ -271,9 +285,17 @@ def _as_move(name: str, together: CombinedMove) -> Move:
     """The combined move as that of one method."""
     covariance = np.sum([*together.covariances.values(), together.disagreement], axis=0)
     return Move(
-        name, "sweep", together.center_in_model, together.twist, covariance, together.undetermined,
-        together.radius_mm, 0, 0.0, 1.0,
-    )  # fmt: skip
+        name,
+        "sweep",
+        together.center_in_model,
+        together.twist,
+        covariance,
+        together.undetermined,
+        together.radius_mm,
+        0,
+        0.0,
+        1.0,
+    )
 
 
 def _bounds(model: Model, names: Sequence[str]) -> Array:

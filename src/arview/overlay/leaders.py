@@ -112,9 +112,7 @@ def _side_of(ax: float, ay: float, bx: float, by: float, cx: float, cy: float) -
 
 
 @kernel
-def _meet(
-    ax: float, ay: float, bx: float, by: float, cx: float, cy: float, dx: float, dy: float
-) -> bool:  # fmt: skip
+def _meet(ax: float, ay: float, bx: float, by: float, cx: float, cy: float, dx: float, dy: float) -> bool:
     """Whether two segments cross, apart from common ends."""
     if max(ax, bx) < min(cx, dx) or max(cx, dx) < min(ax, bx) or max(ay, by) < min(cy, dy) or max(cy, dy) < min(ay, by):
         return False
@@ -124,9 +122,7 @@ def _meet(
 
 
 @kernel
-def _enters(
-    ax: float, ay: float, bx: float, by: float, x: float, y: float, width: float, height: float
-) -> bool:  # fmt: skip
+def _enters(ax: float, ay: float, bx: float, by: float, x: float, y: float, width: float, height: float) -> bool:
     """Whether a segment enters a box (Liang and Barsky, "A new concept and method for line clipping", 1984)."""
     low, high = 0.0, 1.0
     for axis in range(2):
@@ -145,9 +141,22 @@ def _enters(
 
 @kernel
 def _pair_crossings(
-    xi: float, yi: float, wi: float, hi: float, si: int, ui: float, vi: float,
-    xj: float, yj: float, wj: float, hj: float, sj: int, uj: float, vj: float, stub: float
-) -> tuple[int, int, int]:  # fmt: skip
+    xi: float,
+    yi: float,
+    wi: float,
+    hi: float,
+    si: int,
+    ui: float,
+    vi: float,
+    xj: float,
+    yj: float,
+    wj: float,
+    hj: float,
+    sj: int,
+    uj: float,
+    vj: float,
+    stub: float,
+) -> tuple[int, int, int]:
     """Crossings of leader i with leader j, of leader i with box j and of leader j with box i."""
     pi, qi, bi = _port(xi, yi, wi, hi, si, ui, vi, stub)
     pj, qj, bj = _port(xj, yj, wj, hj, sj, uj, vj, stub)
@@ -165,9 +174,13 @@ def _pair_crossings(
 
 @kernel
 def _crossings(
-    x: NDArray[np.float64], sizes: NDArray[np.float64], anchors: NDArray[np.float64], sides: NDArray[np.int64],
-    y: NDArray[np.float64], stub: float
-) -> NDArray[np.int64]:  # fmt: skip
+    x: NDArray[np.float64],
+    sizes: NDArray[np.float64],
+    anchors: NDArray[np.float64],
+    sides: NDArray[np.int64],
+    y: NDArray[np.float64],
+    stub: float,
+) -> NDArray[np.int64]:
     count = len(y)
     result = np.zeros((count, count), dtype=np.int64)
     for i in range(count):
@@ -176,9 +189,22 @@ def _crossings(
             result[i, i] = 1
         for j in range(i):
             leaders, i_in_j, j_in_i = _pair_crossings(
-                xi, y[i], wi, hi, sides[i], anchors[i, 0], anchors[i, 1],
-                x[j, sides[j]], y[j], sizes[j, 0], sizes[j, 1], sides[j], anchors[j, 0], anchors[j, 1], stub,
-            )  # fmt: skip
+                xi,
+                y[i],
+                wi,
+                hi,
+                sides[i],
+                anchors[i, 0],
+                anchors[i, 1],
+                x[j, sides[j]],
+                y[j],
+                sizes[j, 0],
+                sizes[j, 1],
+                sides[j],
+                anchors[j, 0],
+                anchors[j, 1],
+                stub,
+            )
             if (
                 xi < x[j, sides[j]] + sizes[j, 0]
                 and x[j, sides[j]] < xi + wi
@@ -193,10 +219,19 @@ def _crossings(
 
 @kernel
 def _cost(
-    i: int, side: int, top: float, x: NDArray[np.float64], sizes: NDArray[np.float64], anchors: NDArray[np.float64],
-    sides: NDArray[np.int64], y: NDArray[np.float64], is_on: NDArray[np.bool_], old: NDArray[np.float64],
-    bounds: NDArray[np.float64], integral: NDArray[np.float64]
-) -> float:  # fmt: skip
+    i: int,
+    side: int,
+    top: float,
+    x: NDArray[np.float64],
+    sizes: NDArray[np.float64],
+    anchors: NDArray[np.float64],
+    sides: NDArray[np.int64],
+    y: NDArray[np.float64],
+    is_on: NDArray[np.bool_],
+    old: NDArray[np.float64],
+    bounds: NDArray[np.float64],
+    integral: NDArray[np.float64],
+) -> float:
     """Cost of a place of label i beside the others that are on; infinite if it overlaps one.
 
     ``old`` (N,3): side and top before the search, and inertia. ``bounds``: gap, stub, bottom, width of the image.
@@ -232,10 +267,18 @@ def _cost(
 
 @kernel
 def _best_place(
-    i: int, x: NDArray[np.float64], sizes: NDArray[np.float64], anchors: NDArray[np.float64],
-    sides: NDArray[np.int64], y: NDArray[np.float64], is_on: NDArray[np.bool_], old: NDArray[np.float64],
-    rows: NDArray[np.float64], bounds: NDArray[np.float64], integral: NDArray[np.float64]
-) -> tuple[float, int, float]:  # fmt: skip
+    i: int,
+    x: NDArray[np.float64],
+    sizes: NDArray[np.float64],
+    anchors: NDArray[np.float64],
+    sides: NDArray[np.int64],
+    y: NDArray[np.float64],
+    is_on: NDArray[np.bool_],
+    old: NDArray[np.float64],
+    rows: NDArray[np.float64],
+    bounds: NDArray[np.float64],
+    integral: NDArray[np.float64],
+) -> tuple[float, int, float]:
     """Least cost of label i over all places, and that place."""
     best, best_side, best_y = np.inf, sides[i], y[i]
     for side in range(2):
@@ -250,10 +293,19 @@ def _best_place(
 
 @kernel
 def _place_both(
-    i: int, j: int, x: NDArray[np.float64], sizes: NDArray[np.float64], anchors: NDArray[np.float64],
-    sides: NDArray[np.int64], y: NDArray[np.float64], is_on: NDArray[np.bool_], old: NDArray[np.float64],
-    rows: NDArray[np.float64], bounds: NDArray[np.float64], integral: NDArray[np.float64]
-) -> bool:  # fmt: skip
+    i: int,
+    j: int,
+    x: NDArray[np.float64],
+    sizes: NDArray[np.float64],
+    anchors: NDArray[np.float64],
+    sides: NDArray[np.int64],
+    y: NDArray[np.float64],
+    is_on: NDArray[np.bool_],
+    old: NDArray[np.float64],
+    rows: NDArray[np.float64],
+    bounds: NDArray[np.float64],
+    integral: NDArray[np.float64],
+) -> bool:
     """Take labels i and j off and place first i, then j, where that is better; returns whether it was."""
     side_i, y_i, side_j, y_j = sides[i], y[i], sides[j], y[j]
     before = _cost(j, side_j, y_j, x, sizes, anchors, sides, y, is_on, old, bounds, integral)
@@ -270,10 +322,16 @@ def _place_both(
 
 @kernel
 def _search(
-    x: NDArray[np.float64], sizes: NDArray[np.float64], anchors: NDArray[np.float64], sides: NDArray[np.int64],
-    y: NDArray[np.float64], old: NDArray[np.float64], rows: NDArray[np.float64], bounds: NDArray[np.float64],
-    integral: NDArray[np.float64]
-) -> None:  # fmt: skip
+    x: NDArray[np.float64],
+    sizes: NDArray[np.float64],
+    anchors: NDArray[np.float64],
+    sides: NDArray[np.int64],
+    y: NDArray[np.float64],
+    old: NDArray[np.float64],
+    rows: NDArray[np.float64],
+    bounds: NDArray[np.float64],
+    integral: NDArray[np.float64],
+) -> None:
     """Improve sides and tops in place until nothing crosses or no move of one or two labels helps."""
     count = len(y)
     is_on = np.ones(count, dtype=np.bool_)
@@ -292,9 +350,11 @@ def _search(
                 has_improved = True
         for i in range(count):
             for j in range(count):
-                if i != j and crossings[i, j] + crossings[j, i] > 0 and _place_both(
-                    i, j, x, sizes, anchors, sides, y, is_on, old, rows, bounds, integral
-                ):  # fmt: skip
+                if (
+                    i != j
+                    and crossings[i, j] + crossings[j, i] > 0
+                    and _place_both(i, j, x, sizes, anchors, sides, y, is_on, old, rows, bounds, integral)
+                ):
                     has_improved = True
         if not has_improved:
             return

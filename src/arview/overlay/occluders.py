@@ -131,9 +131,20 @@ class OccluderFinder:
         rays = self._ray_grid(step)
         skipped = np.zeros(self._components, dtype=np.bool_) if skipped is None else skipped
         cells, observed = _sample(
-            image, view.u0, view.v0, view.face_ids, view.components, skipped, view.inverse_depth, rays, step,
-            invert(cam_from_model), self._origin, self._cell_mm, np.array(self._cells.shape[:3]),
-        )  # fmt: skip
+            image,
+            view.u0,
+            view.v0,
+            view.face_ids,
+            view.components,
+            skipped,
+            view.inverse_depth,
+            rays,
+            step,
+            invert(cam_from_model),
+            self._origin,
+            self._cell_mm,
+            np.array(self._cells.shape[:3]),
+        )
         table = self._cells.reshape(-1, _COLUMNS)
         known = (cells >= 0) & (table[cells, _COUNT] >= MIN_OBSERVATIONS)
         rows, columns = cells.shape[0], cells.shape[1]
@@ -305,10 +316,20 @@ def _exposure(
 
 @kernel
 def _sample(
-    image: NDArray[np.uint8], u0: int, v0: int, face_ids: NDArray[np.int32], components: NDArray[np.int32],
-    skipped: NDArray[np.bool_], inverse_depth: NDArray[np.float64], rays: NDArray[np.float64], step: int,
-    model_from_cam: NDArray[np.float64], origin: NDArray[np.float64], cell_mm: float, shape: NDArray[np.int64]
-) -> tuple[NDArray[np.int64], NDArray[np.float32]]:  # fmt: skip
+    image: NDArray[np.uint8],
+    u0: int,
+    v0: int,
+    face_ids: NDArray[np.int32],
+    components: NDArray[np.int32],
+    skipped: NDArray[np.bool_],
+    inverse_depth: NDArray[np.float64],
+    rays: NDArray[np.float64],
+    step: int,
+    model_from_cam: NDArray[np.float64],
+    origin: NDArray[np.float64],
+    cell_mm: float,
+    shape: NDArray[np.int64],
+) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
     """Cell (R,C) of the model grid that each sample shows, -1 for none, and its mean colour (R,C,3)."""
     height, width = face_ids.shape
     first_row, first_column = v0 // step, u0 // step
@@ -352,9 +373,13 @@ def _sample(
 
 @kernel
 def _differences(
-    table: NDArray[np.float32], cells: NDArray[np.int64], observed: NDArray[np.float32], known: NDArray[np.bool_],
-    gain: NDArray[np.float32], noise: NDArray[np.float32]
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:  # fmt: skip
+    table: NDArray[np.float32],
+    cells: NDArray[np.int64],
+    observed: NDArray[np.float32],
+    known: NDArray[np.bool_],
+    gain: NDArray[np.float32],
+    noise: NDArray[np.float32],
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
     """Squared difference (R,C) of the hue of each sample from its cell, its variance, and the score of the brightness.
 
     The hue is what is left of the colour at the same brightness. ``noise``: of hue and brightness, and the factors
@@ -392,9 +417,14 @@ def _differences(
 
 @kernel
 def _sure(
-    table: NDArray[np.float32], cells: NDArray[np.int64], observed: NDArray[np.float32], strange: NDArray[np.bool_],
-    known: NDArray[np.bool_], gain: NDArray[np.float32], noise: NDArray[np.float32]
-) -> NDArray[np.bool_]:  # fmt: skip
+    table: NDArray[np.float32],
+    cells: NDArray[np.int64],
+    observed: NDArray[np.float32],
+    strange: NDArray[np.bool_],
+    known: NDArray[np.bool_],
+    gain: NDArray[np.float32],
+    noise: NDArray[np.float32],
+) -> NDArray[np.bool_]:
     """Those strange samples (R,C) whose colour is not between the colours expected of their neighbours.
 
     Samples with a neighbour beside the part are none of them. ``noise`` is as in `_differences`.
@@ -424,9 +454,13 @@ def _sure(
 
 @kernel
 def _learn(
-    table: NDArray[np.float32], cells: NDArray[np.int64], observed: NDArray[np.float32], gain: NDArray[np.float32],
-    occluded: NDArray[np.uint8], rates: NDArray[np.float32]
-) -> None:  # fmt: skip
+    table: NDArray[np.float32],
+    cells: NDArray[np.int64],
+    observed: NDArray[np.float32],
+    gain: NDArray[np.float32],
+    occluded: NDArray[np.uint8],
+    rates: NDArray[np.float32],
+) -> None:
     """Update means, variances and counts of the cells, at the exposure that they have.
 
     ``rates``: weight of a new colour in a cell that was seen often, the same of an occluder, and the largest variance.

@@ -270,10 +270,14 @@ class OverlayRenderer:
     def _make_status(self) -> StatusLine:
         arrows = self._arrows_in_model([DrawnEvidence.SEEN] * len(self._names))
         return StatusLine(
-            self.camera.width, self.camera.height, round(0.95 * self._size_px), self.inspection,
+            self.camera.width,
+            self.camera.height,
+            round(0.95 * self._size_px),
+            self.inspection,
             self._arrow_scale if SHOW_ARROWS and len(arrows) else None,
-            len(self._names) > 1 and self.options.show_evidence, bool(self._pending),
-        )  # fmt: skip
+            len(self._names) > 1 and self.options.show_evidence,
+            bool(self._pending),
+        )
 
     def _make_annotations(self, bottom_px: int) -> Annotations:
         texts = [
@@ -336,9 +340,19 @@ class OverlayRenderer:
             # What was seen to be missing or displaced is shown in full, because it may be why the pose is critical.
             dimming[[not seen.is_refuted for seen in scene.evidence], 3] = _CRITICAL_DIMMING
         blend(
-            canvas, view.u0, view.v0, face_ids, view.shade, view.components,
-            styles.ghost * dimming, cover, owner, styles.edges * dimming, styles.patterns, self._hatch_px,
-        )  # fmt: skip
+            canvas,
+            view.u0,
+            view.v0,
+            face_ids,
+            view.shade,
+            view.components,
+            styles.ghost * dimming,
+            cover,
+            owner,
+            styles.edges * dimming,
+            styles.patterns,
+            self._hatch_px,
+        )
         for index, seen in enumerate(scene.evidence):
             presence = presences[index]
             if seen is DrawnEvidence.DISPLACED and presence is not None and presence.model_from_nominal is not None:

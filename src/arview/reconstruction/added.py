@@ -88,9 +88,14 @@ class EarlierPhotos:
         self.posed = [(photo, one.cam_from_scan) for photo, one in zip(self.photos, whole.photos, strict=True)]
         # The matches of these pairs are found now and remembered, because nobody waits yet.
         match_all_along_lines(
-            model_of_poses(self.posed), self.photos, self.features, options.sparse, self.threads, _nothing,
+            model_of_poses(self.posed),
+            self.photos,
+            self.features,
+            options.sparse,
+            self.threads,
+            _nothing,
             memory=memory,
-        )  # fmt: skip
+        )
 
     def _points_of(self, index: int) -> NDArray[np.int64]:
         """(N,) the point of ``whole`` that each feature of a photo belongs to, or −1."""
@@ -139,10 +144,12 @@ class EarlierPhotos:
                     points.append(self.points[i][rows[known, 0]])
                     pixels.append(one.points_px[rows[known, 1]])
             which = np.concatenate(points) if points else np.zeros(0, dtype=np.int64)
-            found.append((
-                self.whole.points_in_scan[which],
-                np.concatenate(pixels).astype(np.float64) if pixels else np.zeros((0, 2)),
-            ))  # fmt: skip
+            found.append(
+                (
+                    self.whole.points_in_scan[which],
+                    np.concatenate(pixels).astype(np.float64) if pixels else np.zeros((0, 2)),
+                )
+            )
         return found
 
     def add(
@@ -208,9 +215,15 @@ def place_photo(photo: Photo, points: Array, pixels: Array) -> Array | None:
         return None
     rays = photo.camera.unproject(pixels)[:, :2]
     is_good, turn, shift, agree = cv2.solvePnPRansac(
-        points, rays, np.eye(3), None, iterationsCount=3000, reprojectionError=MAX_ERROR_PX / photo.camera.fx,
-        confidence=0.9999, flags=cv2.SOLVEPNP_EPNP,
-    )  # fmt: skip
+        points,
+        rays,
+        np.eye(3),
+        None,
+        iterationsCount=3000,
+        reprojectionError=MAX_ERROR_PX / photo.camera.fx,
+        confidence=0.9999,
+        flags=cv2.SOLVEPNP_EPNP,
+    )
     if not is_good or agree is None or len(agree) < MIN_INLIERS:
         return None
     some = agree.ravel()

@@ -53,9 +53,11 @@ class Features:
     def taken(self, which: NDArray[Any]) -> Features:
         """Some of the features, by indices or a mask."""
         return Features(
-            self.points_px[which], np.ascontiguousarray(self.descriptors[which]), self.sizes_px[which],
+            self.points_px[which],
+            np.ascontiguousarray(self.descriptors[which]),
+            self.sizes_px[which],
             self.colors[which],
-        )  # fmt: skip
+        )
 
 
 _NONE = Features(

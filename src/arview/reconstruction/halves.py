@@ -89,9 +89,7 @@ def adjusted_alone(
 
 def _listed(photo: PosedPhoto) -> Photo:
     """A placed photo as a photo of intake; its camera is that of the model."""
-    return Photo(
-        photo.name, photo.path, photo.camera.width, photo.camera.height, "", photo.camera, mask=photo.mask
-    )  # fmt: skip
+    return Photo(photo.name, photo.path, photo.camera.width, photo.camera.height, "", photo.camera, mask=photo.mask)
 
 
 def onto(sparse: SparseModel, whole: SparseModel) -> tuple[float, Array]:

@@ -59,9 +59,11 @@ class KnownPairs:
 
 
 def chosen_pairs(
-    photos: Sequence[Photo], features: Sequence[Features], known: KnownPairs,
+    photos: Sequence[Photo],
+    features: Sequence[Features],
+    known: KnownPairs,
     pool: ThreadPoolExecutor,
-) -> list[Pair]:  # fmt: skip
+) -> list[Pair]:
     """Pairs of photos to be matched, in a fixed order."""
     if known.recorded is not None:
         place = {photo.name: index for index, photo in enumerate(photos)}
@@ -92,9 +94,13 @@ def _trusted_poses(photos: Sequence[Photo], known: KnownPairs) -> Mapping[str, A
 
 
 def doubtful_pairs(
-    photos: Sequence[Photo], features: Sequence[Features], known: KnownPairs,
-    tried: Sequence[Pair], matched: Sequence[Pair], pool: ThreadPoolExecutor,
-) -> list[Pair]:  # fmt: skip
+    photos: Sequence[Photo],
+    features: Sequence[Features],
+    known: KnownPairs,
+    tried: Sequence[Pair],
+    matched: Sequence[Pair],
+    pool: ThreadPoolExecutor,
+) -> list[Pair]:
     """More pairs of photos whose rough pose led to too few partners, so that it is likely to be wrong."""
     poses = _trusted_poses(photos, known)
     if known.recorded is not None or not poses:

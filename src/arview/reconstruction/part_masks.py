@@ -60,9 +60,14 @@ MIN_FOUND = 3
 
 
 def placed_with_silhouettes(
-    photos: Sequence[Photo], folder: Path, masks_folder: Path, silhouettes: Silhouettes,
-    place: Callable[[Sequence[Photo], Path], SparseModel], tell: Progress, can_place_again: bool = True,
-) -> SparseModel:  # fmt: skip
+    photos: Sequence[Photo],
+    folder: Path,
+    masks_folder: Path,
+    silhouettes: Silhouettes,
+    place: Callable[[Sequence[Photo], Path], SparseModel],
+    tell: Progress,
+    can_place_again: bool = True,
+) -> SparseModel:
     """The placed photos with masks of the part; or without masks where the part is not found, with a remark.
 
     Args:
@@ -123,8 +128,11 @@ def _placed_by_part(
         except CannotMeasureError as error:
             problem = f"the part was found in {len(masked)} photos, which could not be placed by it alone: {error}"
         else:
-            left_out = [(one.name, "the part was not found in it, so that it has no silhouette (--masks auto)")
-                        for one in photos if one.name not in found.masks]  # fmt: skip
+            left_out = [
+                (one.name, "the part was not found in it, so that it has no silhouette (--masks auto)")
+                for one in photos
+                if one.name not in found.masks
+            ]
             sparse = replace(sparse, unplaced=(*sparse.unplaced, *left_out))
             remark = f"masks from the CAD's silhouette: placed by the part alone, because {reason}; from {found.detail}"
             wide = silhouettes.at_poses(sparse, masks_folder, tell)

@@ -164,9 +164,13 @@ class _ReconstructionRun:
     """One run, with its folder and options and the time of its stages."""
 
     def __init__(
-        self, folder: Path, part: Part | None, options: ReconstructOptions, tell: Progress,
+        self,
+        folder: Path,
+        part: Part | None,
+        options: ReconstructOptions,
+        tell: Progress,
         memory: SparseMemory | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.folder, self.part, self.options, self.tell, self.memory = folder, part, options, tell, memory
         self.stages = Stages(folder)
         self.seconds: dict[str, float] = {}
@@ -262,9 +266,14 @@ class _ReconstructionRun:
         if silhouettes is None:
             return self._placed(photos, folder)
         return placed_with_silhouettes(
-            photos, folder, self.folder / "silhouettes", silhouettes, self._placed, self.tell,
+            photos,
+            folder,
+            self.folder / "silhouettes",
+            silhouettes,
+            self._placed,
+            self.tell,
             can_place_again=self.options.poses is None,
-        )  # fmt: skip
+        )
 
     def _placed(self, photos: Sequence[Photo], folder: Path) -> SparseModel:
         """The photos placed by structure from motion, or by the poses that were given."""
@@ -448,9 +457,14 @@ def summary(result: Reconstruction) -> dict[str, Any]:
 def camera_summary(camera: Any) -> dict[str, Any]:
     """A camera for JSON, in arview's own format."""
     return {
-        "width": camera.width, "height": camera.height, "fx": camera.fx, "fy": camera.fy, "cx": camera.cx,
-        "cy": camera.cy, "dist": camera.dist.tolist(),
-    }  # fmt: skip
+        "width": camera.width,
+        "height": camera.height,
+        "fx": camera.fx,
+        "fy": camera.fy,
+        "cx": camera.cx,
+        "cy": camera.cy,
+        "dist": camera.dist.tolist(),
+    }
 
 
 def pose_deviations(sparse: SparseModel) -> Array | None:

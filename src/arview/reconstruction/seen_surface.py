@@ -108,8 +108,13 @@ def _pieces(corners: Array, size_mm: float, max_pieces: int) -> tuple[Array, NDA
 
 
 def _sees(
-    camera: Camera, cam_from_model: Array, vertices: Array, faces: NDArray[np.int32], middles: Array, normals: Array,
-) -> NDArray[np.bool_]:  # fmt: skip
+    camera: Camera,
+    cam_from_model: Array,
+    vertices: Array,
+    faces: NDArray[np.int32],
+    middles: Array,
+    normals: Array,
+) -> NDArray[np.bool_]:
     """(P,) whether a photo shows the middle of each piece."""
     scale = min(1.0, MAX_SIDE_PX / max(camera.width, camera.height))
     ideal = camera.without_distortion()

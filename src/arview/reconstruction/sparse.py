@@ -78,9 +78,13 @@ class SparseOptions:
 
 
 def reconstruct_sparse(
-    photos: Sequence[Photo], folder: Path, options: SparseOptions | None = None, progress: Progress | None = None,
-    known: KnownPairs | None = None, memory: SparseMemory | None = None,
-) -> SparseModel:  # fmt: skip
+    photos: Sequence[Photo],
+    folder: Path,
+    options: SparseOptions | None = None,
+    progress: Progress | None = None,
+    known: KnownPairs | None = None,
+    memory: SparseMemory | None = None,
+) -> SparseModel:
     """Reconstruct poses and points of the photos; COLMAP's database and model are left in ``folder``.
 
     Args:
@@ -196,9 +200,15 @@ def moving_features(
 
 
 def match_by_appearance(
-    photos: Sequence[Photo], features: Sequence[Features], options: SparseOptions, threads: int, tell: Progress,
-    min_move_px: float, known: KnownPairs, memory: SparseMemory,
-) -> tuple[list[Pair], dict[Pair, Matches]]:  # fmt: skip
+    photos: Sequence[Photo],
+    features: Sequence[Features],
+    options: SparseOptions,
+    threads: int,
+    tell: Progress,
+    min_move_px: float,
+    known: KnownPairs,
+    memory: SparseMemory,
+) -> tuple[list[Pair], dict[Pair, Matches]]:
     """The pairs that were matched, and the matches of those that have enough of them near epipolar lines.
 
     Before a still background, matches that move by less than ``min_move_px`` are left out.
@@ -315,9 +325,14 @@ def cameras_and_poses(model: Any, photos: Sequence[Photo]) -> tuple[dict[int, Ca
 
 
 def triangulate_and_adjust(
-    model: Any, path: Path, folder: Path, options: SparseOptions, threads: int, tell: Progress,
+    model: Any,
+    path: Path,
+    folder: Path,
+    options: SparseOptions,
+    threads: int,
+    tell: Progress,
     keeps_centre: bool = False,
-) -> tuple[Any, Any]:  # fmt: skip
+) -> tuple[Any, Any]:
     """Points triangulated from all matches; then poses, points and intrinsics adjusted together.
 
     ``keeps_centre`` leaves principal points as an earlier adjustment has found them. Returns the model and the adjuster

@@ -130,9 +130,14 @@ class RefinementPyramid:
             level = self.level(number)
             picture = level.picture
             cam_from_body, information = level.refiner.refine(
-                picture.image, picture.smooth, cam_from_body, stages if number == start else finer_stages, appearance,
-                level.matches(matches), use_region=picture.has_colors,
-            )  # fmt: skip
+                picture.image,
+                picture.smooth,
+                cam_from_body,
+                stages if number == start else finer_stages,
+                appearance,
+                level.matches(matches),
+                use_region=picture.has_colors,
+            )
         # An enlarged picture holds no more than the frame.
         return cam_from_body, information / max(self.scales[-1], 1.0) ** 2
 

@@ -197,9 +197,18 @@ class PoseRefiner:
         """
         weights = self._weights if use_region and appearance.is_known else self._weights_without_color
         pose, information = run_stages(
-            image, gray, appearance.colors, self.part.arrays, cam_from_body, self.intrinsics, self._step_mm,
-            stage_table(stages), self._damping, weights, matches,
-        )  # fmt: skip
+            image,
+            gray,
+            appearance.colors,
+            self.part.arrays,
+            cam_from_body,
+            self.intrinsics,
+            self._step_mm,
+            stage_table(stages),
+            self._damping,
+            weights,
+            matches,
+        )
         return pose, information
 
     def refine_fresh(
@@ -243,9 +252,17 @@ class PoseRefiner:
     ) -> PoseEvidence:
         """Evidence of the picture for a pose (4,4); steps farther from an edge than the tolerance do not support it."""
         terms = run_evidence(
-            image, gray, appearance.colors, appearance.is_known, self.part.arrays, cam_from_body, self.intrinsics,
-            self._step_mm, EDGE_THRESHOLD, tolerance_px,
-        )  # fmt: skip
+            image,
+            gray,
+            appearance.colors,
+            appearance.is_known,
+            self.part.arrays,
+            cam_from_body,
+            self.intrinsics,
+            self._step_mm,
+            EDGE_THRESHOLD,
+            tolerance_px,
+        )
         return PoseEvidence(**terms._asdict())
 
     def edge_spread_px(self, gray: NDArray[np.uint8], cam_from_body: Array) -> float | None:
@@ -257,7 +274,12 @@ class PoseRefiner:
         """Outline and design edges at a pose (4,4), and the support of the picture for each of their points."""
         return EdgeSteps(
             *run_edge_steps(
-                gray, self.part.arrays, cam_from_body, self.intrinsics, self._step_mm, EDGE_THRESHOLD,
+                gray,
+                self.part.arrays,
+                cam_from_body,
+                self.intrinsics,
+                self._step_mm,
+                EDGE_THRESHOLD,
                 tolerance_px,
             )
-        )  # fmt: skip
+        )

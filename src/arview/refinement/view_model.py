@@ -89,18 +89,27 @@ def find_unresolvable(views: GuideViewSet) -> NDArray[np.bool_]:
     is_design = ((kinds & EDGE_SHARP) > 0) & ((kinds & EDGE_CONTOUR) == 0)
     unresolvable = np.zeros(len(kinds), dtype=np.bool_)
     _mark_unresolvable(
-        views.directions, raw["edge_start"], raw["edge_points"], raw["edge_tangents"] * UNIT_16, is_design,
-        np.float32(views.diameter_mm), unresolvable,
-    )  # fmt: skip
+        views.directions,
+        raw["edge_start"],
+        raw["edge_points"],
+        raw["edge_tangents"] * UNIT_16,
+        is_design,
+        np.float32(views.diameter_mm),
+        unresolvable,
+    )
     return unresolvable
 
 
 @kernel(fastmath=True)
 def _mark_unresolvable(
-    directions: NDArray[np.float64], starts: NDArray[np.int64], points: NDArray[np.float32],
-    tangents: NDArray[np.float32], is_design: NDArray[np.bool_], diameter_mm: float | np.float32,
-    unresolvable: NDArray[np.bool_]
-) -> None:  # fmt: skip
+    directions: NDArray[np.float64],
+    starts: NDArray[np.int64],
+    points: NDArray[np.float32],
+    tangents: NDArray[np.float32],
+    is_design: NDArray[np.bool_],
+    diameter_mm: float | np.float32,
+    unresolvable: NDArray[np.bool_],
+) -> None:
     """Mark edge points, see `find_unresolvable`. Edges are compared in the image plane of each view."""
     nearest, furthest = np.float32(SAME_LINE) * diameter_mm, np.float32(MIN_SEPARATION) * diameter_mm
     along = np.float32(MAX_ALONG) * diameter_mm

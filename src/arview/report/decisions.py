@@ -98,8 +98,10 @@ def _rendered(source: Path, state: RecordState) -> dict[str, Any]:
     entries = log_of(source).entries()
     rows = [_row(one, source) for one in entries if one.kind != "tick"]
     made = {"record": module.record(state), "decisions": module.section(state, rows, _ticks(entries), _checked(state))}
-    return {f"{name}_html": Markup("").join((Markup(_marks(name)[0]), made[name], Markup(_marks(name)[1])))
-            for name in _PARTS}  # fmt: skip
+    return {
+        f"{name}_html": Markup("").join((Markup(_marks(name)[0]), made[name], Markup(_marks(name)[1])))
+        for name in _PARTS
+    }
 
 
 def _checked(state: RecordState) -> list[dict[str, str]]:

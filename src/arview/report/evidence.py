@@ -74,9 +74,13 @@ def gather(
 
 
 def _reconstruction(
-    inspection: Inspection, source: Path, part: Part | None, folder: str | Path | None, photos: str | Path | None,
+    inspection: Inspection,
+    source: Path,
+    part: Part | None,
+    folder: str | Path | None,
+    photos: str | Path | None,
     absent: dict[str, str],
-) -> tuple[SparseModel | None, DenseCloud | None]:  # fmt: skip
+) -> tuple[SparseModel | None, DenseCloud | None]:
     """Photos and cloud of the reconstruction, transformed to the datum frame."""
     from arview.measurement.folder import in_model_frame, read_folder
 

@@ -20,9 +20,15 @@ PANGO_INSTALL_COMMAND = (
 
 
 def make_report(
-    inspection: str | Path, html: str | Path | None = None, pdf: str | Path | None = None, part: Part | None = None,
-    *, folder: str | Path | None = None, photos: str | Path | None = None, progress: Progress | None = None,
-) -> ReportEvidence:  # fmt: skip
+    inspection: str | Path,
+    html: str | Path | None = None,
+    pdf: str | Path | None = None,
+    part: Part | None = None,
+    *,
+    folder: str | Path | None = None,
+    photos: str | Path | None = None,
+    progress: Progress | None = None,
+) -> ReportEvidence:
     """Write the report of an inspection as one self-contained HTML file, as PDF, or both.
 
     Args:
@@ -66,9 +72,11 @@ def pdf_of(page: str, evidence: ReportEvidence) -> bytes:
     """The page as PDF/A-3 with the inspection attached."""
     weasyprint = _weasyprint()
     attachment = weasyprint.Attachment(
-        string=evidence.source.read_bytes(), name=evidence.source.name, description="the inspection (arview)",
+        string=evidence.source.read_bytes(),
+        name=evidence.source.name,
+        description="the inspection (arview)",
         relationship="Source",
-    )  # fmt: skip
+    )
     return bytes(weasyprint.HTML(string=page).write_pdf(attachments=[attachment], pdf_variant="pdf/a-3u"))
 
 

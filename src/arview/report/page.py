@@ -420,8 +420,11 @@ def _viewer(evidence: ReportEvidence) -> dict[str, Any]:
         lead.append(evidence.absent.get("cloud", "There is no cloud."))
     if has_uncovered:
         lead.append("Hatched: surfaces that no two photos saw; the CAD model stands in for them.")
-    modes = [(name, text) for name, text in (("photo", "photos"), ("distance", "distance to the CAD model"))
-             if ("colors" if name == "photo" else "distances") in cloud]  # fmt: skip
+    modes = [
+        (name, text)
+        for name, text in (("photo", "photos"), ("distance", "distance to the CAD model"))
+        if ("colors" if name == "photo" else "distances") in cloud
+    ]
     return {
         "scene": Markup(scene_json(scene)),
         "scene_lead": " ".join(lead),

@@ -75,8 +75,11 @@ class Gallery:
 
 
 def make_gallery(
-    inspection: Inspection, model: Model, sparse: SparseModel, progress: StepProgress | None = None,
-) -> Gallery:  # fmt: skip
+    inspection: Inspection,
+    model: Model,
+    sparse: SparseModel,
+    progress: StepProgress | None = None,
+) -> Gallery:
     """Crops from the photos that show each object best: one for components that passed, else two.
 
     Args:
@@ -248,8 +251,12 @@ def _corners(bounds: Array) -> Array:
 
 
 def _component_crop(
-    deviation: ComponentDeviation, inspection: Inspection, model: Model, photo: PosedPhoto, image: RgbImage,
-) -> Crop:  # fmt: skip
+    deviation: ComponentDeviation,
+    inspection: Inspection,
+    model: Model,
+    photo: PosedPhoto,
+    image: RgbImage,
+) -> Crop:
     """A crop with the overlay of a component at its design position and an arrow to its measured position."""
     bounds = model.component(deviation.name).bounds_in_model
     crop, camera = _cut(image, photo, _corners(bounds))

@@ -14,9 +14,15 @@ from arview.quality.rework import drawing_svg, instructions
 from arview.report.evidence import ReportEvidence
 
 _HOW = {
-    "install": "install", "adjust": "adjust", "unbolt": "unbolt and move", "reweld": "weld again",
-    "reglue": "glue again", "shim": "shim", "bend": "bend", "replace": "replace",
-}  # fmt: skip
+    "install": "install",
+    "adjust": "adjust",
+    "unbolt": "unbolt and move",
+    "reweld": "weld again",
+    "reglue": "glue again",
+    "shim": "shim",
+    "bend": "bend",
+    "replace": "replace",
+}
 MAX_SIDE_PX = 900
 """Longer side of the pictures that a report holds."""
 

@@ -35,9 +35,12 @@ MARGIN = 0.15
 
 
 def make_scene(
-    inspection: Inspection, model: Model | None, cloud: DenseCloud | None, distances: DistanceMap | None,
+    inspection: Inspection,
+    model: Model | None,
+    cloud: DenseCloud | None,
+    distances: DistanceMap | None,
     sparse: SparseModel | None = None,
-) -> dict[str, Any] | None:  # fmt: skip
+) -> dict[str, Any] | None:
     """The scene as a JSON object; None when there is neither CAD model nor cloud. All data are in one frame.
 
     Surfaces of the CAD that no two photos saw are listed on their own, to be hatched: there the CAD model stands in

@@ -134,7 +134,7 @@ class AppearanceMemory:
             start = np.array([middle, middle, rolls_between(self._stored.rotations[k], rotation), 1.0])
             score, _ = pattern_search(
                 picture, self._stored.pictures[k], self._stored.masks[k], start, NEIGHBOUR_STEPS, 1
-            )  # fmt: skip
+            )
             if score >= SAME_SCORE:
                 return True
         return False

@@ -235,9 +235,18 @@ class GuidedInit:
 
         def search(start: Array) -> list[tuple[float, Array]]:
             scores, poses = score_around(
-                maps[0], self._refiner.part.arrays, start, maps[1], 0.01 * self._refiner.diameter_mm,
-                level.turns, level.stretches, level.shift_px, level.shift_step_px, CONTOUR_POINTS, DESIGN_POINTS,
-            )  # fmt: skip
+                maps[0],
+                self._refiner.part.arrays,
+                start,
+                maps[1],
+                0.01 * self._refiner.diameter_mm,
+                level.turns,
+                level.stretches,
+                level.shift_px,
+                level.shift_step_px,
+                CONTOUR_POINTS,
+                DESIGN_POINTS,
+            )
             best: list[tuple[float, Array]] = []
             for index in np.argsort(-scores)[:MAX_SCORED]:
                 if not any(self._is_same(poses[index], other, level.separation_deg) for _, other in best):

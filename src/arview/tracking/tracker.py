@@ -184,8 +184,12 @@ class Tracker:
         """
         frame = self._prepare(image)
         for propose in (
-            self._predicted, self._other_schedules, self._searched, self._rechecked, self._shaded,
-        ):  # fmt: skip
+            self._predicted,
+            self._other_schedules,
+            self._searched,
+            self._rechecked,
+            self._shaded,
+        ):
             for proposal in propose(frame):
                 candidate = self._refine(frame, proposal)
                 if self._is_better(frame, candidate, proposal):

@@ -77,9 +77,11 @@ class CadSilhouettes:
         poses: dict[str, tuple[Camera, Array]] = {}
         for view_range in search_ranges(self.part, [photo.camera for photo in photos], SPANS):
             views = cached_guide_views(
-                self.part.model, view_range, GuideViewOptions(subdivisions=SUBDIVISIONS),
+                self.part.model,
+                view_range,
+                GuideViewOptions(subdivisions=SUBDIVISIONS),
                 progress=lambda done, total: tell("guide views", done, total),
-            )  # fmt: skip
+            )
             detectors: dict[str, Detector] = {}
             for done, photo in enumerate(photos):
                 tell("finding the part", done, len(photos))
@@ -148,9 +150,7 @@ def silhouette_mask(
     reach_px = margin_mm * small.fx / nearest_mm + options.edge_px
     pad = int(np.ceil(min(reach_px, 0.5 * max(small.width, small.height))))
     low, (width, height) = low - pad, (high - low + 1 + 2 * pad).astype(int)
-    inverse_depth, _ = rasterise(
-        vertices, model.mesh[1], small.fx, small.fy, -low[0], -low[1], int(width), int(height)
-    )  # fmt: skip
+    inverse_depth, _ = rasterise(vertices, model.mesh[1], small.fx, small.fy, -low[0], -low[1], int(width), int(height))
     if not (inverse_depth > 0).any():
         return np.zeros(columns.shape, dtype=np.bool_)
     distance = cv2.distanceTransform((inverse_depth <= 0).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)

@@ -101,9 +101,12 @@ def resize_responses(maps: NDArray[np.uint8], width: int, height: int, spread_px
 
 @kernel
 def mean_edge_response(
-    maps: NDArray[np.uint8], part: ViewArrays, pose: NDArray[np.float64], intrinsics: NDArray[np.float64],
-    step_mm: float
-) -> float:  # fmt: skip
+    maps: NDArray[np.uint8],
+    part: ViewArrays,
+    pose: NDArray[np.float64],
+    intrinsics: NDArray[np.float64],
+    step_mm: float,
+) -> float:
     """Mean edge response 0–1 under the outline and the design edges of a part, which weigh at most half.
 
     Args:

@@ -172,9 +172,7 @@ def spin_moves(component: Component, surface: MeshSurface, part: Part | None, mi
     return vectors[values > 0.1]
 
 
-def cloud_component(
-    name: str, model: Model, part: Part | None, views: SurfaceVisibility | None
-) -> CloudComponent:  # fmt: skip
+def cloud_component(name: str, model: Model, part: Part | None, views: SurfaceVisibility | None) -> CloudComponent:
     """A component with what the photos can see of it, and with its neighbours at nominal."""
     component = model.component(name)
     surface = MeshSurface(component.vertices_in_model, component.faces)
@@ -197,9 +195,15 @@ def cloud_component(
     usable[faces[seen]] = True
     is_spread = np.arange(len(tried)) < len(spread)
     return CloudComponent(
-        component, surface, others, tried[is_spread & seen & (to_others > joint)], tried[is_spread & touches], usable,
-        spin_moves(component, surface, part), joint,
-    )  # fmt: skip
+        component,
+        surface,
+        others,
+        tried[is_spread & seen & (to_others > joint)],
+        tried[is_spread & touches],
+        usable,
+        spin_moves(component, surface, part),
+        joint,
+    )
 
 
 def _only_scanned(components: Sequence[CloudComponent], points: CloudPoints) -> list[CloudComponent]:
@@ -298,9 +302,11 @@ def _missing(c: CloudComponent, near: CloudPoints, own: CloudPoints) -> NotMeasu
     behind = _covered(c.contact, near.points, max(1.0, 2.0 * GRID_MM)) if len(c.contact) else 0.0
     if behind > 0.4:
         return NotMeasured(
-            name, "cloud", f"missing: no surface where it should be, and {100 * behind:.0f} % of what it would cover "
-            "is seen", is_missing=True,
-        )  # fmt: skip
+            name,
+            "cloud",
+            f"missing: no surface where it should be, and {100 * behind:.0f} % of what it would cover is seen",
+            is_missing=True,
+        )
     return NotMeasured(name, "cloud", f"not covered by the cloud: {len(own)} points near its place")
 
 
@@ -326,9 +332,15 @@ def _register(c: CloudComponent, own: CloudPoints, start: Array | None) -> Regis
     for _ in range(6):
         free = _orthogonal_complement(fixed) / scales
         fit = register_from_starts(
-            own.points, c.surface, starts, normals=own.normals, point_weights=1.0 / own.sigma**2, options=options,
-            free=free, **given,
-        )  # fmt: skip
+            own.points,
+            c.surface,
+            starts,
+            normals=own.normals,
+            point_weights=1.0 / own.sigma**2,
+            options=options,
+            free=free,
+            **given,
+        )
         values, vectors = np.linalg.eigh(fit.covariance * np.outer(scales, scales))
         loose = vectors[:, values > MAX_STD_MM**2].T
         unknown = np.concatenate([fit.undetermined, loose])
@@ -340,9 +352,15 @@ def _register(c: CloudComponent, own: CloudPoints, start: Array | None) -> Regis
     # The influence of the kernel's width on the result is part of its uncertainty.
     wide = replace(options, min_width_mm=DOUBT_WIDTH_MM, noise_points=0)
     other = register_to_surface(
-        own.points, c.surface, fit.surface_from_points, normals=own.normals, point_weights=1.0 / own.sigma**2,
-        options=wide, free=free, **given,
-    )  # fmt: skip
+        own.points,
+        c.surface,
+        fit.surface_from_points,
+        normals=own.normals,
+        point_weights=1.0 / own.sigma**2,
+        options=wide,
+        free=free,
+        **given,
+    )
     doubt = other.twist - fit.twist
     return replace(fit, covariance=fit.covariance + np.outer(doubt, doubt))
 
@@ -386,15 +404,26 @@ def _move(c: CloudComponent, fit: Registration, support: float) -> Move:
     if support < 0.6:
         notes.append(f"only {100 * support:.0f} % of its visible surface is in the cloud")
     return Move(
-        component=c.component.name, method="cloud", center_in_model=c.center, twist=twist, covariance=covariance,
-        undetermined=undetermined, radius_mm=c.radius_mm, used=int(np.count_nonzero(fit.weights > 0.1)),
-        residual_mm=fit.sigma_mm, support=support, notes=tuple(notes),
-    )  # fmt: skip
+        component=c.component.name,
+        method="cloud",
+        center_in_model=c.center,
+        twist=twist,
+        covariance=covariance,
+        undetermined=undetermined,
+        radius_mm=c.radius_mm,
+        used=int(np.count_nonzero(fit.weights > 0.1)),
+        residual_mm=fit.sigma_mm,
+        support=support,
+        notes=tuple(notes),
+    )
 
 
 def _with_swapped_name(
-    found: Move | NotMeasured, c: CloudComponent, all_of_them: Sequence[CloudComponent], cloud: CloudPoints,
-) -> Move | NotMeasured:  # fmt: skip
+    found: Move | NotMeasured,
+    c: CloudComponent,
+    all_of_them: Sequence[CloudComponent],
+    cloud: CloudPoints,
+) -> Move | NotMeasured:
     """Add to a component that did not fit the name of another one whose shape does: the two may be swapped."""
     if isinstance(found, Move) or found.is_missing or "shape" not in found.reason or c.others is None:
         return found
@@ -407,10 +436,13 @@ def _with_swapped_name(
         there = rigid(np.eye(3), foot - other.others.closest(other.center[None]).points[0])
         vertices = apply(there, other.component.vertices_in_model)
         trial = replace(
-            other, component=Component(c.component.name, vertices, other.component.faces), others=c.others,
-            surface=MeshSurface(vertices, other.component.faces), samples=apply(there, other.samples),
+            other,
+            component=Component(c.component.name, vertices, other.component.faces),
+            others=c.others,
+            surface=MeshSurface(vertices, other.component.faces),
+            samples=apply(there, other.samples),
             contact=apply(there, other.contact),
-        )  # fmt: skip
+        )
         if isinstance(_measure(trial, cloud, np.eye(4)), Move):
             return replace(found, reason=f"{found.reason}; it has the shape of {other.component.name}: swapped?")
     return found

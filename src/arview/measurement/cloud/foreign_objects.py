@@ -51,8 +51,11 @@ class ForeignObject:
 
 
 def find_foreign(
-    cloud: DenseCloud, model: Model, places: Mapping[str, Array] | None = None, unknown: Sequence[str] = (),
-) -> list[ForeignObject]:  # fmt: skip
+    cloud: DenseCloud,
+    model: Model,
+    places: Mapping[str, Array] | None = None,
+    unknown: Sequence[str] = (),
+) -> list[ForeignObject]:
     """Find objects inside the model's bounding box that are far from all of its surfaces, largest first.
 
     Args:

@@ -210,9 +210,14 @@ def _separated(places: list[tuple[float, float, Array]]) -> list[tuple[float, fl
 
 
 def _refined(
-    points: Array, normals: Array | None, surface: MeshSurface, samples: Array, start: tuple[float, Array],
-    with_scale: bool, limit_mm: float,
-) -> tuple[float, float, Array]:  # fmt: skip
+    points: Array,
+    normals: Array | None,
+    surface: MeshSurface,
+    samples: Array,
+    start: tuple[float, Array],
+    with_scale: bool,
+    limit_mm: float,
+) -> tuple[float, float, Array]:
     """Cost, scale and pose (4,4) on the exact surface: Gauss–Newton on up to seven parameters with Tukey's weights."""
     scale, pose = start
     width, size = 4.0 * limit_mm, 0.25 * float(np.linalg.norm(np.ptp(samples, axis=0)))

@@ -202,9 +202,18 @@ def _target(model: Model) -> _Target:
     share = np.sqrt(weights) / np.sqrt(weights).sum()
     first = rng.choice(len(samples), size=min(MODEL_POINTS, len(samples) // 2), replace=False, p=share)
     return _Target(
-        surface, np.ascontiguousarray(samples[first]), np.ascontiguousarray(normals[first]), weights[first],
-        samples[::4], weights[::4] / weights[::4].sum(), diameter, nodes, field, low, cell,
-    )  # fmt: skip
+        surface,
+        np.ascontiguousarray(samples[first]),
+        np.ascontiguousarray(normals[first]),
+        weights[first],
+        samples[::4],
+        weights[::4] / weights[::4].sum(),
+        diameter,
+        nodes,
+        field,
+        low,
+        cell,
+    )
 
 
 class _PairTable:
@@ -236,9 +245,13 @@ class _PairTable:
         return pairs[of_pair], self._pairs[first[of_pair] + at]
 
     def _keys(
-        self, points: Array, normals: Array, pairs: NDArray[np.int64], diameter_mm: float,
+        self,
+        points: Array,
+        normals: Array,
+        pairs: NDArray[np.int64],
+        diameter_mm: float,
         rng: np.random.Generator | None = None,
-    ) -> NDArray[np.int64]:  # fmt: skip
+    ) -> NDArray[np.int64]:
         """(K,) cell of each pair: distance, both angles with the connecting line, angle of the normals.
 
         With ``rng`` each value is moved at random by up to half a cell.
@@ -318,34 +331,64 @@ def _near_lists(scene: ScenePoints, diameter_mm: float, rng: np.random.Generator
 
 
 def _scored(
-    poses: Array, start: NDArray[np.int64], lists: NDArray[np.int64], scene: ScenePoints, normals: Array,
-    target: _Target, reach: float,
-) -> Array:  # fmt: skip
+    poses: Array,
+    start: NDArray[np.int64],
+    lists: NDArray[np.int64],
+    scene: ScenePoints,
+    normals: Array,
+    target: _Target,
+    reach: float,
+) -> Array:
     """(K,) scores of poses, computed in all threads."""
     lists = np.ascontiguousarray(lists)
 
     def work(part: NDArray[np.int64]) -> Array:
         return scores(
-            poses[part], start[part], lists, scene.points, normals, scene.weights, target.nodes, target.field,
-            target.low, target.cell, reach * target.diameter_mm, scene.is_oriented,
-        )  # fmt: skip
+            poses[part],
+            start[part],
+            lists,
+            scene.points,
+            normals,
+            scene.weights,
+            target.nodes,
+            target.field,
+            target.low,
+            target.cell,
+            reach * target.diameter_mm,
+            scene.is_oriented,
+        )
 
     parts = np.array_split(np.arange(len(poses)), 4 * thread_count())
     return np.concatenate(list(pool().map(work, parts)))
 
 
 def _refine(
-    poses: Array, start: NDArray[np.int64], lists: NDArray[np.int64], scene: ScenePoints, normals: Array,
+    poses: Array,
+    start: NDArray[np.int64],
+    lists: NDArray[np.int64],
+    scene: ScenePoints,
+    normals: Array,
     target: _Target,
-) -> Array:  # fmt: skip
+) -> Array:
     """Poses refined in the distance field, in all threads."""
     reaches = target.diameter_mm * np.geomspace(1.5 * COARSE_REACH, FINE_REACH, 14)
 
     def work(part: NDArray[np.int64]) -> Array:
         return refined(
-            poses[part], start[part], lists, scene.points, normals, scene.weights, target.nodes, target.field,
-            target.low, target.cell, reaches, 0.3 * target.diameter_mm, scene.is_oriented,
-        )  # fmt: skip
+            poses[part],
+            start[part],
+            lists,
+            scene.points,
+            normals,
+            scene.weights,
+            target.nodes,
+            target.field,
+            target.low,
+            target.cell,
+            reaches,
+            0.3 * target.diameter_mm,
+            scene.is_oriented,
+        )
 
     parts = np.array_split(np.arange(len(poses)), 4 * thread_count())
     return np.concatenate(list(pool().map(work, parts)))
@@ -374,9 +417,14 @@ def _exact(start: tuple[Array, float], scene: ScenePoints, target: _Target) -> P
     near = np.all((moved > low) & (moved < high), axis=1)
     points, normals = scene.fine[near], sign * scene.fine_normals[near]
     options = RegistrationOptions(
-        noise_points=0, first_distance_mm=2.0 * reach_mm, last_distance_mm=min(0.5, reach_mm), threshold_mm=1e-3,
-        threshold_deg=1e-3, max_iterations=25, min_points=20,
-    )  # fmt: skip
+        noise_points=0,
+        first_distance_mm=2.0 * reach_mm,
+        last_distance_mm=min(0.5, reach_mm),
+        threshold_mm=1e-3,
+        threshold_deg=1e-3,
+        max_iterations=25,
+        min_points=20,
+    )
     for _ in range(2):  # unoriented normals follow the surface at the start
         if not scene.is_oriented and len(points):
             closest = target.surface.closest(apply(pose, points), 3.0 * reach_mm)

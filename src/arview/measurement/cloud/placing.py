@@ -31,9 +31,12 @@ def dense_cloud(points: Array, normals: NDArray[np.floating] | None) -> DenseClo
     count = len(points)
     normals32 = np.zeros((count, 3), np.float32) if normals is None else np.asarray(normals, dtype=np.float32)
     return DenseCloud(
-        np.asarray(points, dtype=np.float64), normals32, np.zeros((count, 3), np.uint8),
-        np.full(count, np.nan, np.float32), np.zeros(count, np.uint8),
-    )  # fmt: skip
+        np.asarray(points, dtype=np.float64),
+        normals32,
+        np.zeros((count, 3), np.uint8),
+        np.full(count, np.nan, np.float32),
+        np.zeros(count, np.uint8),
+    )
 
 
 def cloud_in_mm(raw: RawPoints, unit: str) -> DenseCloud:
@@ -129,9 +132,11 @@ def moved_to_model(cloud: DenseCloud, found: Similarity) -> DenseCloud:
     """The cloud in the frame of the CAD."""
     rotation = found.model_from_scan[:3, :3].astype(np.float32)
     return replace(
-        cloud, points=apply(found.model_from_scan, cloud.points * found.scale if found.scale != 1.0 else cloud.points),
-        normals=cloud.normals @ rotation.T, sigma=np.asarray(cloud.sigma * found.scale, dtype=np.float32),
-    )  # fmt: skip
+        cloud,
+        points=apply(found.model_from_scan, cloud.points * found.scale if found.scale != 1.0 else cloud.points),
+        normals=cloud.normals @ rotation.T,
+        sigma=np.asarray(cloud.sigma * found.scale, dtype=np.float32),
+    )
 
 
 def check_belongs(points: CloudPoints, model: Model, band_mm: float) -> None:

@@ -255,8 +255,10 @@ def register_from_starts(
     """
     o = options or RegistrationOptions()
     few = slice(None, None, -(-len(points) // coarse_points))
-    some = {"normals": normals[few] if normals is not None else None,
-            "point_weights": point_weights[few] if point_weights is not None else None}  # fmt: skip
+    some = {
+        "normals": normals[few] if normals is not None else None,
+        "point_weights": point_weights[few] if point_weights is not None else None,
+    }
     quick = replace(o, noise_points=0, threshold_mm=0.01, threshold_deg=0.01, max_iterations=15)
     found: list[Registration] = []
     failure: InputError | None = None
@@ -277,9 +279,14 @@ def register_from_starts(
         if np.sqrt(np.mean(np.sum((apply(item.surface_from_points, points[few]) - placed) ** 2, axis=1))) > apart_mm
     ]
     result = register_to_surface(
-        points, surface, best.surface_from_points, normals=normals, point_weights=point_weights,
-        options=replace(o, first_distance_mm=max(o.last_distance_mm, min(o.first_distance_mm, limit))), **given,  # type: ignore[arg-type]
-    )  # fmt: skip
+        points,
+        surface,
+        best.surface_from_points,
+        normals=normals,
+        point_weights=point_weights,
+        options=replace(o, first_distance_mm=max(o.last_distance_mm, min(o.first_distance_mm, limit))),
+        **given,  # type: ignore[arg-type]
+    )
     if not rivals:
         return result
     cost, rival = min(rivals, key=lambda item: item[0])
@@ -304,10 +311,19 @@ class _LinearSystem:
 
 
 def _measure(
-    points: Array, point_normals: Array | None, base: Array, surface: MeshSurface,
-    usable_faces: NDArray[np.bool_] | None, pose: Array, center: Array, radius: float, basis: Array, width: float,
-    hint: NDArray[np.int64] | None, o: RegistrationOptions,
-) -> _LinearSystem:  # fmt: skip
+    points: Array,
+    point_normals: Array | None,
+    base: Array,
+    surface: MeshSurface,
+    usable_faces: NDArray[np.bool_] | None,
+    pose: Array,
+    center: Array,
+    radius: float,
+    basis: Array,
+    width: float,
+    hint: NDArray[np.int64] | None,
+    o: RegistrationOptions,
+) -> _LinearSystem:
     """Residuals, weights and normal equations at a pose; rotations are in mm at ``radius``."""
     moved = apply(pose, points)
     reach = min(max(DISTANCE_SIGMAS * width, o.last_distance_mm), o.first_distance_mm)
@@ -338,9 +354,18 @@ def _measure(
     kept = values > MIN_INFORMATION * weights.sum()
     gradient = weighted.T @ np.where(counts, residuals, 0.0)
     return _LinearSystem(
-        residuals, weights, rows, normals, moved, hessian, gradient, values[kept], vectors[:, kept], sigma,
+        residuals,
+        weights,
+        rows,
+        normals,
+        moved,
+        hessian,
+        gradient,
+        values[kept],
+        vectors[:, kept],
+        sigma,
         closest.faces,
-    )  # fmt: skip
+    )
 
 
 def _kernel(size: Array, kernel: str) -> Array:
@@ -353,9 +378,16 @@ def _kernel(size: Array, kernel: str) -> Array:
 
 
 def _result(
-    system: _LinearSystem, pose: Array, center: Array, radius: float, basis: Array, base: Array, iterations: int,
-    converged: bool, o: RegistrationOptions,
-) -> Registration:  # fmt: skip
+    system: _LinearSystem,
+    pose: Array,
+    center: Array,
+    radius: float,
+    basis: Array,
+    base: Array,
+    iterations: int,
+    converged: bool,
+    o: RegistrationOptions,
+) -> Registration:
     """The registration with its covariance."""
     determined = system.vectors.T @ basis
     scales = _scales(radius)

@@ -109,9 +109,15 @@ def scene_points(points: Array, normals: Array | None, diameter_mm: float) -> Sc
         coarse = _thin(points, cell)
     weights = plane_weights(points[coarse], estimated[coarse], 0.01 * diameter_mm)
     return ScenePoints(
-        np.ascontiguousarray(points[coarse]), np.ascontiguousarray(estimated[coarse]), weights, points[fine],
-        estimated[fine], FINE * diameter_mm, is_oriented, before - len(points),
-    )  # fmt: skip
+        np.ascontiguousarray(points[coarse]),
+        np.ascontiguousarray(estimated[coarse]),
+        weights,
+        points[fine],
+        estimated[fine],
+        FINE * diameter_mm,
+        is_oriented,
+        before - len(points),
+    )
 
 
 def wide_planes(points: Array, normals: Array, diameter_mm: float) -> Flags:

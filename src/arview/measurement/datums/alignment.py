@@ -96,9 +96,13 @@ class Alignment:
 
 
 def align(
-    datums: Sequence[DatumEquations], origin: Array, size_mm: float, base: DatumEquations | None = None,
-    scale_std: float = 0.0, finds_scale: bool = False,
-) -> Alignment:  # fmt: skip
+    datums: Sequence[DatumEquations],
+    origin: Array,
+    size_mm: float,
+    base: DatumEquations | None = None,
+    scale_std: float = 0.0,
+    finds_scale: bool = False,
+) -> Alignment:
     """Solve for the datum frame.
 
     Args:
@@ -168,9 +172,16 @@ def align(
 
 
 def _result(
-    origin: Array, move: Array, gain: Array, variances: Array, equations: Sequence[DatumEquations], starts: Array,
-    found: Sequence[tuple[DatumFit, str]], notes: tuple[str, ...], size_mm: float,
-) -> Alignment:  # fmt: skip
+    origin: Array,
+    move: Array,
+    gain: Array,
+    variances: Array,
+    equations: Sequence[DatumEquations],
+    starts: Array,
+    found: Sequence[tuple[DatumFit, str]],
+    notes: tuple[str, ...],
+    size_mm: float,
+) -> Alignment:
     """The alignment with its covariance, and the result of each datum."""
     results, gains = [], []
     scale_covariance = variances[0] * np.outer(gain[:, 0], gain[:, 0])
@@ -195,10 +206,18 @@ def _result(
         used = int((fit.weights > 0.1 * fit.weights.max()).sum())
         results.append(
             DatumResult(
-                one.label, one.feature, locked, used, one.of, fit.sigma_mm, fit.correlation, fit.radius_mm,
-                rest_mm, share,
+                one.label,
+                one.feature,
+                locked,
+                used,
+                one.of,
+                fit.sigma_mm,
+                fit.correlation,
+                fit.radius_mm,
+                rest_mm,
+                share,
             )
-        )  # fmt: skip
+        )
         gains.append(part)
         covariance = covariance + share
     used_equations = tuple(equations[: len(found)])

@@ -73,9 +73,16 @@ def point_from_move(arms: Array) -> Array:
 
 
 def surface_equations(
-    label: str, feature: str, points: Array, normals: Array, offsets_mm: Array, variances: Array,
-    of: int | None = None, by_radius: Array | None = None, locks: tuple[str, ...] = DOF_NAMES,
-) -> DatumEquations:  # fmt: skip
+    label: str,
+    feature: str,
+    points: Array,
+    normals: Array,
+    offsets_mm: Array,
+    variances: Array,
+    of: int | None = None,
+    by_radius: Array | None = None,
+    locks: tuple[str, ...] = DOF_NAMES,
+) -> DatumEquations:
     """Equations of offsets (N,) along unit normals (N,3) at points (N,3) of the model; see `DatumEquations`."""
     rows = np.einsum("ni,nij->nj", normals, point_from_move(points))
     count = len(points) if of is None else of

@@ -41,8 +41,11 @@ _EDGE_BAND_MM = (2.0, 15.0)
 
 
 def measure_datums_in_cloud(
-    datums: tuple[Datum, ...], model: Model, cloud: DenseCloud, moves: Mapping[str, Move],
-) -> list[DatumEquations]:  # fmt: skip
+    datums: tuple[Datum, ...],
+    model: Model,
+    cloud: DenseCloud,
+    moves: Mapping[str, Move],
+) -> list[DatumEquations]:
     """Measure the offsets of each datum feature in a cloud.
 
     Args:

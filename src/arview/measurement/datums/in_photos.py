@@ -153,9 +153,16 @@ def _measure_rim(datum: Datum, views: PhotoViews) -> DatumEquations:
 
     steps = _find_steps(datum, views, edges_at, design_of, 4, px_mm)
     equations = surface_equations(
-        datum.label, datum.feature, points[which[steps.ok]], steps.directions, steps.offsets, steps.variances,
-        len(which), steps.design[:, 3], datum.locks,
-    )  # fmt: skip
+        datum.label,
+        datum.feature,
+        points[which[steps.ok]],
+        steps.directions,
+        steps.offsets,
+        steps.variances,
+        len(which),
+        steps.design[:, 3],
+        datum.locks,
+    )
     angles = (np.arange(len(points)) * 2 * np.pi / len(points))[which[steps.ok]]
     shift_mm = rim_shift_mm(steps.design, steps.offsets, steps.variances, angles, RIM_PX * px_mm)
     return replace(equations, form_mm=shift_mm, by_form=waves(steps.design[:, 3], angles))
@@ -181,9 +188,14 @@ class _Steps:
 
 
 def _find_steps(
-    datum: Datum, views: PhotoViews, edges_at: Callable[[Array], tuple[EdgePoints, Array]],
-    design_of: Callable[[Array, NDArray[np.bool_]], Array], unknowns: int, px_mm: float, rcond: float = 1e-15,
-) -> _Steps:  # fmt: skip
+    datum: Datum,
+    views: PhotoViews,
+    edges_at: Callable[[Array], tuple[EdgePoints, Array]],
+    design_of: Callable[[Array, NDArray[np.bool_]], Array],
+    unknowns: int,
+    px_mm: float,
+    rcond: float = 1e-15,
+) -> _Steps:
     """Search for steps three times: once over a wide range, then around the place that the previous search gave.
 
     Args:
@@ -272,9 +284,16 @@ def _measure_cylinder(datum: Datum, views: PhotoViews) -> DatumEquations:
     radial /= np.linalg.norm(radial, axis=1, keepdims=True)
     variances = found.variances_mm2 + MIN_SIGMA_MM**2
     return surface_equations(
-        datum.label, "cylinder", samples.points[ok], radial[ok], found.offsets_mm[ok], variances[ok], seen,
-        np.full(np.count_nonzero(ok), side), datum.locks,
-    )  # fmt: skip
+        datum.label,
+        "cylinder",
+        samples.points[ok],
+        radial[ok],
+        found.offsets_mm[ok],
+        variances[ok],
+        seen,
+        np.full(np.count_nonzero(ok), side),
+        datum.locks,
+    )
 
 
 def _measure_edge(datum: Datum, views: PhotoViews) -> DatumEquations:
@@ -296,11 +315,23 @@ def _measure_edge(datum: Datum, views: PhotoViews) -> DatumEquations:
     inside = 0.5 * (line.start + line.end) - 10.0 * line.normals.sum(axis=0)
     tangents = np.tile(line.direction, (len(which), 1))
     steps = _find_steps(
-        datum, views, lambda shift: (EdgePoints(points[which] + shift, tangents, view), inside),
-        lambda directions, _: directions @ project, 3, px_mm, rcond=1e-6,
-    )  # fmt: skip
+        datum,
+        views,
+        lambda shift: (EdgePoints(points[which] + shift, tangents, view), inside),
+        lambda directions, _: directions @ project,
+        3,
+        px_mm,
+        rcond=1e-6,
+    )
     equations = surface_equations(
-        datum.label, "edge", points[which[steps.ok]], steps.directions, steps.offsets, steps.variances, len(which),
-        None, datum.locks,
-    )  # fmt: skip
+        datum.label,
+        "edge",
+        points[which[steps.ok]],
+        steps.directions,
+        steps.offsets,
+        steps.variances,
+        len(which),
+        None,
+        datum.locks,
+    )
     return replace(equations, form_mm=DATUM_EDGE_PX * px_mm)

@@ -41,8 +41,11 @@ class MeasuredDatums:
 
 
 def measure_each(
-    datums: Sequence[Datum], measure: MeasureDatum, model: Model, rest: DatumEquations | None,
-) -> MeasuredDatums:  # fmt: skip
+    datums: Sequence[Datum],
+    measure: MeasureDatum,
+    model: Model,
+    rest: DatumEquations | None,
+) -> MeasuredDatums:
     """Measure the datums in their order of precedence; one that fails does not stop the others.
 
     Args:
@@ -129,8 +132,9 @@ def _other_holes(datum: Datum, component: Component) -> list[Datum]:
     for rim in find_rims(component):
         arm = rim.center_in_model - point
         aside = float(np.linalg.norm(arm - axis * (axis @ arm)))
-        is_known = any(np.linalg.norm(np.cross(np.array(o.point_in_model) - rim.center_in_model, axis)) < 0.1
-                       for _, o in found)  # fmt: skip
+        is_known = any(
+            np.linalg.norm(np.cross(np.array(o.point_in_model) - rim.center_in_model, axis)) < 0.1 for _, o in found
+        )
         if abs(float(rim.axis_in_model @ axis)) < 0.999 or aside < 0.5 * rim.radius_mm or is_known:
             continue
         x, y, z = rim.center_in_model.tolist()

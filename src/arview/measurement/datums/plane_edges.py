@@ -35,9 +35,7 @@ RIVAL_PX = 3.0
 """Rim points with the opposite rim this near in a photo are not used there."""
 
 
-def measure_plane_by_edges(
-    datum: Datum, views: PhotoViews, whole: Move | None = None
-) -> DatumEquations:  # fmt: skip
+def measure_plane_by_edges(datum: Datum, views: PhotoViews, whole: Move | None = None) -> DatumEquations:
     """Equations of a datum plane from steps of brightness across all edges of the component that lie in it.
 
     Shift and turn of these edges are fitted in space from all photos at once; only the two rotations and the
@@ -75,9 +73,17 @@ def measure_plane_by_edges(
     move = _combined(moves, directions)
     equations, _ = move_equations(datum.label, move, datum.locks)
     return DatumEquations(
-        equations.label, "fit", equations.rows, equations.offsets_mm, equations.variances, equations.points,
-        equations.of, None, datum.locks, directions=directions,
-    )  # fmt: skip
+        equations.label,
+        "fit",
+        equations.rows,
+        equations.offsets_mm,
+        equations.variances,
+        equations.points,
+        equations.of,
+        None,
+        datum.locks,
+        directions=directions,
+    )
 
 
 def _check_seen(datum: Datum, edges: EdgePoints) -> None:
@@ -110,9 +116,12 @@ def _combined(moves: list[Move], directions: Array) -> Move:
         squares = float(apart @ np.linalg.solve(covariances[0] + covariances[1], apart)) / len(apart)
         covariance = covariance * max(1.0, squares)
     return replace(
-        first, method="edges", twist=directions @ value, covariance=directions @ covariance @ directions.T,
+        first,
+        method="edges",
+        twist=directions @ value,
+        covariance=directions @ covariance @ directions.T,
         undetermined=np.linalg.svd(directions.T)[2][directions.shape[1] :],
-    )  # fmt: skip
+    )
 
 
 def _by_own_edges(datum: Datum, edges: EdgePoints, views: PhotoViews) -> Move:
@@ -156,9 +165,14 @@ def plane_directions(normal: Array) -> Array:
 
 
 def _fitted(
-    edges: EdgePoints, place: Array, center: Array, radius_mm: float, views: PhotoViews, reach_px: float,
+    edges: EdgePoints,
+    place: Array,
+    center: Array,
+    radius_mm: float,
+    views: PhotoViews,
+    reach_px: float,
     px_mm: float,
-) -> tuple[RigidFit, Array] | None:  # fmt: skip
+) -> tuple[RigidFit, Array] | None:
     """Motion of the edges from a place (4,4), and the twist (6,) that a shift of all of them to the dark side makes.
 
     None if too few steps are found.
@@ -172,7 +186,14 @@ def _fitted(
     slope = np.abs(found.slopes[ok])
     sigmas = 0.3 * found.mm_per_px[ok] * np.sqrt((slope + HALF_SLOPE) / slope)
     fit = fit_rigid(
-        move_rows(moved.points[ok], found.directions[ok], middle), found.offsets_mm[ok], sigmas, np.zeros((0, 6)),
-        radius_mm, REACH_MM, moved.points[ok] / (4.0 * px_mm), MIN_SIGMA_PX / 0.3, max_pairs=3000,
-    )  # fmt: skip
+        move_rows(moved.points[ok], found.directions[ok], middle),
+        found.offsets_mm[ok],
+        sigmas,
+        np.zeros((0, 6)),
+        radius_mm,
+        REACH_MM,
+        moved.points[ok] / (4.0 * px_mm),
+        MIN_SIGMA_PX / 0.3,
+        max_pairs=3000,
+    )
     return fit, fit.gain @ (np.sign(found.slopes[ok]) * found.mm_per_px[ok]) * (0.5 * MAX_DARK_SHIFT_PX)

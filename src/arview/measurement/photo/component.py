@@ -64,9 +64,15 @@ class MeasuredComponent:
         return np.asarray(grid[np.argsort(np.linalg.norm(grid, axis=1), kind="stable")])
 
     def move(
-        self, method: Method, fit: RigidFit, by_poses: Array, place: Array, systematic_mm: float, support: float,
+        self,
+        method: Method,
+        fit: RigidFit,
+        by_poses: Array,
+        place: Array,
+        systematic_mm: float,
+        support: float,
         common: Array | None = None,
-    ) -> Move:  # fmt: skip
+    ) -> Move:
         """The measured move from the last fit.
 
         Args:

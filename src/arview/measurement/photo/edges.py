@@ -95,9 +95,14 @@ class EdgeOffsets:
 
 
 def edge_offsets(
-    edges: EdgePoints, center: Array, views: PhotoViews, reach_px: float, level: int = 0,
-    shift_px: float = 0.0, gaps_px: Array | None = None,
-) -> EdgeOffsets:  # fmt: skip
+    edges: EdgePoints,
+    center: Array,
+    views: PhotoViews,
+    reach_px: float,
+    level: int = 0,
+    shift_px: float = 0.0,
+    gaps_px: Array | None = None,
+) -> EdgeOffsets:
     """Find a step of brightness across each predicted edge point.
 
     Args:
@@ -327,9 +332,14 @@ class ComponentEdges:
         return rigid(np.eye(3), best)
 
     def _fit(
-        self, edges: EdgePoints, found: EdgeOffsets, ok: NDArray[np.bool_], place: Array, dark_mm: float,
+        self,
+        edges: EdgePoints,
+        found: EdgeOffsets,
+        ok: NDArray[np.bool_],
+        place: Array,
+        dark_mm: float,
         is_last: bool = True,
-    ) -> tuple[RigidFit, float]:  # fmt: skip
+    ) -> tuple[RigidFit, float]:
         """Fit with all edges shifted to the dark side by ``dark_mm``; also return the shift for the next round."""
         size, slope = found.mm_per_px[ok], found.slopes[ok]
         sigmas = _SIGMA_PX * size * np.sqrt((np.abs(slope) + HALF_SLOPE) / np.abs(slope))
@@ -337,11 +347,18 @@ class ComponentEdges:
         rows = move_rows(edges.points[ok], found.directions[ok], center)
         dark = np.sign(slope)
         fit = fit_rigid(
-            rows, found.offsets_mm[ok] - dark * dark_mm, sigmas, self.body.free_at(place), self.body.radius_mm,
-            UNDETERMINED_MM, edges.points[ok] / (4.0 * self.body.px_mm), MIN_SIGMA_PX / _SIGMA_PX,
-            move_rows(edges.points[found.seen], found.directions[found.seen], center), MIN_DIRECTION,
+            rows,
+            found.offsets_mm[ok] - dark * dark_mm,
+            sigmas,
+            self.body.free_at(place),
+            self.body.radius_mm,
+            UNDETERMINED_MM,
+            edges.points[ok] / (4.0 * self.body.px_mm),
+            MIN_SIGMA_PX / _SIGMA_PX,
+            move_rows(edges.points[found.seen], found.directions[found.seen], center),
+            MIN_DIRECTION,
             max_pairs=len(ok) if is_last else _FEW_PAIRS,
-        )  # fmt: skip
+        )
         left = found.offsets_mm[ok] - rows @ fit.twist
         limit = MAX_DARK_SHIFT_PX * self.body.px_mm
         # The denominator holds a weak prior at zero.
@@ -371,9 +388,13 @@ _SIGMA_PX = 0.3
 
 @kernel(numpy_errors=True)
 def _vote(
-    hypotheses: NDArray[np.float64], weights: NDArray[np.float64], directions: NDArray[np.float64],
-    shifts: NDArray[np.float64], width: float, share: float
-) -> NDArray[np.float64]:  # fmt: skip
+    hypotheses: NDArray[np.float64],
+    weights: NDArray[np.float64],
+    directions: NDArray[np.float64],
+    shifts: NDArray[np.float64],
+    width: float,
+    share: float,
+) -> NDArray[np.float64]:
     """Sum over edge points of the best step near the place to which each shift moves the edge.
 
     Args:

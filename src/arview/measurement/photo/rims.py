@@ -89,9 +89,15 @@ def fit_rim(
                 f"{len(np.unique(edges.view[ok]))} photos at {np.count_nonzero(ok)} points; take photos that show it"
             )
         fit = fit_rigid(
-            _rows(found, outward)[ok], found.offsets_mm[ok], 0.3 * found.mm_per_px[ok], np.array(locked), 1.0,
-            reach_mm, edges.points[ok] / (4.0 * px_mm), MIN_SIGMA_PX / 0.3,
-        )  # fmt: skip
+            _rows(found, outward)[ok],
+            found.offsets_mm[ok],
+            0.3 * found.mm_per_px[ok],
+            np.array(locked),
+            1.0,
+            reach_mm,
+            edges.points[ok] / (4.0 * px_mm),
+            MIN_SIGMA_PX / 0.3,
+        )
         shift = shift + fit.twist[3:]
         radius_mm += float(fit.twist[0])
     systematic_mm = SYSTEMATIC_PX * px_mm

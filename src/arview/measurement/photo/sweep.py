@@ -199,9 +199,15 @@ def without_outliers(
 
 
 def agreeing_scores(
-    patches: Array, is_on: NDArray[np.bool_], shades: Array, normals: Array, steps: Array, chosen: Indices,
-    views: PhotoViews, min_contrast: float,
-) -> tuple[NDArray[np.float32], NDArray[np.int8], Indices]:  # fmt: skip
+    patches: Array,
+    is_on: NDArray[np.bool_],
+    shades: Array,
+    normals: Array,
+    steps: Array,
+    chosen: Indices,
+    views: PhotoViews,
+    min_contrast: float,
+) -> tuple[NDArray[np.float32], NDArray[np.int8], Indices]:
     """Sweep, drop the views that differ from the others, and sweep those samples again.
 
     Args:
@@ -270,9 +276,9 @@ def pose_rows(views: PhotoViews, samples: Samples, chosen: Indices) -> Array:
         by_model = by_cam @ pose[:3, :3]
         moment[of] += np.swapaxes(by_model, 1, 2) @ by_model
         # A left twist (rotation w, translation t) moves a point x in the camera by w × x + t.
-        turned = np.stack([
-            np.stack([zero, z, -y], axis=1), np.stack([-z, zero, x], axis=1), np.stack([y, -x, zero], axis=1)
-        ], axis=1)  # fmt: skip
+        turned = np.stack(
+            [np.stack([zero, z, -y], axis=1), np.stack([-z, zero, x], axis=1), np.stack([y, -x, zero], axis=1)], axis=1
+        )
         by_twist = np.concatenate([by_cam @ turned, by_cam], axis=2)
         parts.append((view, of, np.swapaxes(by_model, 1, 2) @ by_twist))
     inverse = np.linalg.pinv(moment)
@@ -398,9 +404,15 @@ class ComponentSweep:
                 break
             sigmas = np.full(np.count_nonzero(ok), 0.3 * coarse_mm)
             twist = fit_rigid(
-                rows[ok], found.offsets_mm[ok], sigmas, self.body.free, self.body.radius_mm,
-                UNDETERMINED_MM, self._places(self.samples.of(ok)), 0.3,
-            ).twist  # fmt: skip
+                rows[ok],
+                found.offsets_mm[ok],
+                sigmas,
+                self.body.free,
+                self.body.radius_mm,
+                UNDETERMINED_MM,
+                self._places(self.samples.of(ok)),
+                0.3,
+            ).twist
         return self.body.moved(np.eye(4), twist)
 
     def _fit(self, moved: Samples, found: SweepOffsets, seen: NDArray[np.bool_], place: Array) -> RigidFit:
@@ -408,10 +420,17 @@ class ComponentSweep:
         ok = found.is_ok
         rows = move_rows(moved.points, moved.normals, apply(place, self.body.center))
         return fit_rigid(
-            rows[ok], found.offsets_mm[ok], np.sqrt(found.variances_mm2[ok] + MIN_SIGMA_MM**2),
-            self.body.free_at(place), self.body.radius_mm, UNDETERMINED_MM, self._places(moved.of(ok)),
-            0.3, rows[seen], MIN_DIRECTION,
-        )  # fmt: skip
+            rows[ok],
+            found.offsets_mm[ok],
+            np.sqrt(found.variances_mm2[ok] + MIN_SIGMA_MM**2),
+            self.body.free_at(place),
+            self.body.radius_mm,
+            UNDETERMINED_MM,
+            self._places(moved.of(ok)),
+            0.3,
+            rows[seen],
+            MIN_DIRECTION,
+        )
 
     def _places(self, samples: Samples) -> Array:
         """(N,6) positions in patch widths and scaled normals, so that faces of different orientation are far apart."""

@@ -124,9 +124,12 @@ class MeasuredPlacement:
 
 
 def place(
-    combined: CombinedMove, alignment: Alignment, poses: Array | None = None,
-    options: UncertaintyOptions | None = None, axes: Array | None = None,
-) -> MeasuredPlacement:  # fmt: skip
+    combined: CombinedMove,
+    alignment: Alignment,
+    poses: Array | None = None,
+    options: UncertaintyOptions | None = None,
+    axes: Array | None = None,
+) -> MeasuredPlacement:
     """Position of a component relative to the datum frame, with every contribution to its uncertainty.
 
     Args:
@@ -174,9 +177,16 @@ def place(
         block = held @ covariance[part, part] @ held
         lengths.append(length_of(held @ twist[part], block, some, int(seen.sum())))
     return MeasuredPlacement(
-        twist, covariance, contributions, combined.undetermined, observable_axes(combined.undetermined, np.eye(3)),
-        axes, own_observable, lengths[0], lengths[1],
-    )  # fmt: skip
+        twist,
+        covariance,
+        contributions,
+        combined.undetermined,
+        observable_axes(combined.undetermined, np.eye(3)),
+        axes,
+        own_observable,
+        lengths[0],
+        lengths[1],
+    )
 
 
 def observable_axes(undetermined: Array, axes: Array, tolerance: float = 0.05) -> NDArray[np.bool_]:

@@ -73,9 +73,12 @@ class CombinedMove:
         """The same move, stated for another point (3,) of the component."""
         names = tuple(self.covariances)
         twist, parts, undetermined = moved_to(
-            self.twist, [*self.covariances.values(), self.disagreement], self.undetermined, self.radius_mm,
+            self.twist,
+            [*self.covariances.values(), self.disagreement],
+            self.undetermined,
+            self.radius_mm,
             point_in_model - self.center_in_model,
-        )  # fmt: skip
+        )
         covariances = dict(zip(names, parts[:-1], strict=True))
         return CombinedMove(twist, covariances, parts[-1], undetermined, self.radius_mm, point_in_model)
 
@@ -125,9 +128,13 @@ def combine(moves: Sequence[Move]) -> CombinedMove:
             disagreement += axes @ _between(axes.T @ twists[i], axes.T @ twists[j], axes.T @ twist) @ axes.T
     shares = [gain @ one @ gain.T / scaled for gain, one in zip(gains, noise, strict=True)]
     return CombinedMove(
-        twist / unit, {move.method: share for move, share in zip(moves, shares, strict=True)},
-        disagreement / scaled, vectors[:, ~known].T, radius, moves[0].center_in_model,
-    )  # fmt: skip
+        twist / unit,
+        {move.method: share for move, share in zip(moves, shares, strict=True)},
+        disagreement / scaled,
+        vectors[:, ~known].T,
+        radius,
+        moves[0].center_in_model,
+    )
 
 
 def _beyond_chance(
@@ -182,13 +189,15 @@ def agreements(moves: Sequence[Move]) -> tuple[Agreement, ...]:
             turn, shift = np.split(shared @ apart, 2)
             found.append(
                 Agreement(
-                    a.method, b.method, float(np.linalg.norm(shift)),
+                    a.method,
+                    b.method,
+                    float(np.linalg.norm(shift)),
                     quantile_of_length((shared @ joint @ shared.T)[3:, 3:]),
                     float(np.rad2deg(np.linalg.norm(turn) / a.radius_mm)),
                     float(np.sqrt(squares / chi2_quantile(freedom, 0.95))),
                     squares > chi2_quantile(freedom, CONTRADICTION),
                 )
-            )  # fmt: skip
+            )
     return tuple(found)
 
 

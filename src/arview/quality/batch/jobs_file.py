@@ -36,9 +36,14 @@ video = "films/PL-0418.mp4"
 
 LOCATION_FIELDS = ("part", "photos", "video", "camera", "video_camera", "scale_file", "masks", "sparse")
 _KINDS = {
-    "tolerance_mm": float, "guard": float, "max_frames": int, "seed": int, "threads": int, "makes_pdf": bool,
+    "tolerance_mm": float,
+    "guard": float,
+    "max_frames": int,
+    "seed": int,
+    "threads": int,
+    "makes_pdf": bool,
     "compares_halves": bool,
-}  # fmt: skip
+}
 _NAME = re.compile(r"[\w][\w.+-]*")
 
 

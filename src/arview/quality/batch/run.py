@@ -101,10 +101,20 @@ def _inspect(job: InspectJob, folder: Path) -> tuple[str, str]:
 
 
 INSPECTION = Work(
-    _inspect_key, _inspect,
-    ("inspection.json", "report.html", "report.pdf", "annotated.mp4", "poses.jsonl", "cloud.ply",
-     "inspection_distances/distances.ply", "inspection_distances/map.png", "inspection_distances/histogram.png"),
-)  # fmt: skip
+    _inspect_key,
+    _inspect,
+    (
+        "inspection.json",
+        "report.html",
+        "report.pdf",
+        "annotated.mp4",
+        "poses.jsonl",
+        "cloud.ply",
+        "inspection_distances/distances.ply",
+        "inspection_distances/map.png",
+        "inspection_distances/histogram.png",
+    ),
+)
 
 
 def run_job(job: BatchJob, work: Work = INSPECTION, scratch: str | None = None) -> JobResult:
@@ -183,9 +193,12 @@ def _has_fingerprint(content: bytes | None, sha256: str) -> bool:
 
 
 def run_batch(
-    jobs: Sequence[BatchJob], options: BatchOptions | None = None, work: Work = INSPECTION,
-    started: Callable[[str, int], None] | None = None, progress: Callable[[JobResult], None] | None = None,
-) -> list[JobResult]:  # fmt: skip
+    jobs: Sequence[BatchJob],
+    options: BatchOptions | None = None,
+    work: Work = INSPECTION,
+    started: Callable[[str, int], None] | None = None,
+    progress: Callable[[JobResult], None] | None = None,
+) -> list[JobResult]:
     """Run all jobs and return their results in the order of the jobs.
 
     A job whose worker dies is given to another worker, and a job that fails because of storage or memory is retried,
@@ -216,10 +229,11 @@ def run_batch(
             threads = max(1, (os.cpu_count() or 1) // len(workers))
             jobs = [one if one.job.threads else replace(one, job=replace(one.job, threads=threads)) for one in jobs]
         futures = {
-            client.submit(run_job, one, work, options.scratch, key=f"arview-{one.name}", pure=False,
-                          retries=options.retries): one
+            client.submit(
+                run_job, one, work, options.scratch, key=f"arview-{one.name}", pure=False, retries=options.retries
+            ): one
             for one in jobs
-        }  # fmt: skip
+        }
         try:
             for future in as_completed(futures):
                 job = futures[future]
@@ -281,11 +295,16 @@ def _client(options: BatchOptions, count: int) -> Iterator[Client]:
         number = options.workers or default_workers(options.memory_limit)
         with (
             LocalCluster(
-                n_workers=min(number, count), threads_per_worker=1, processes=True, host="127.0.0.1",
-                memory_limit=options.memory_limit, dashboard_address="127.0.0.1:0", silence_logs=50,
+                n_workers=min(number, count),
+                threads_per_worker=1,
+                processes=True,
+                host="127.0.0.1",
+                memory_limit=options.memory_limit,
+                dashboard_address="127.0.0.1:0",
+                silence_logs=50,
             ) as cluster,
             Client(cluster) as client,
-        ):  # fmt: skip
+        ):
             yield client
 
 

@@ -68,16 +68,26 @@ _FIELDS: dict[Kind, tuple[str, ...]] = {
     "signature": ("note", "inspection_sha256", "rechecks"),
 }
 _TYPES: dict[str, tuple[type, ...]] = {
-    "component": (str,), "is_ok": (bool,), "reason": (str,), "note": (str,), "photo": (str, type(None)),
-    "step": (int,), "is_done": (bool,), "inspection_sha256": (str,), "rechecks": (list,),
-}  # fmt: skip
+    "component": (str,),
+    "is_ok": (bool,),
+    "reason": (str,),
+    "note": (str,),
+    "photo": (str, type(None)),
+    "step": (int,),
+    "is_done": (bool,),
+    "inspection_sha256": (str,),
+    "rechecks": (list,),
+}
 
 
 def decision_document(entry: Decision) -> dict[str, Any]:
     """The entry as JSON, with the fields of its kind; what the log holds, the page gets and the exports write."""
     document: dict[str, Any] = {
-        "entry": entry.number, "kind": entry.kind, "time": stamp(entry.time), "by": entry.by,
-    }  # fmt: skip
+        "entry": entry.number,
+        "kind": entry.kind,
+        "time": stamp(entry.time),
+        "by": entry.by,
+    }
     values = {name: getattr(entry, name) for name in _FIELDS[entry.kind]}
     values |= {name: list(value) for name, value in values.items() if isinstance(value, tuple)}
     return document | values | {"previous": entry.previous}
@@ -114,9 +124,14 @@ def entry_of(line: bytes, sha256: str) -> Decision:
             raise ValueError("rechecks has another type")
         values["rechecks"] = tuple(values["rechecks"])
     return Decision(
-        number=number, kind=kind, time=moment.astimezone(UTC), by=document["by"], previous=document["previous"],
-        sha256=sha256, **values,
-    )  # fmt: skip
+        number=number,
+        kind=kind,
+        time=moment.astimezone(UTC),
+        by=document["by"],
+        previous=document["previous"],
+        sha256=sha256,
+        **values,
+    )
 
 
 def stamp(moment: datetime) -> str:

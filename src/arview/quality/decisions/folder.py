@@ -111,9 +111,14 @@ def state_of_record(target: str | Path, inspection: Inspection | None = None) ->
 
 
 def decide_component(
-    target: str | Path, component: str, is_ok: bool, reason: str, note: str = "", by: str = "",
+    target: str | Path,
+    component: str,
+    is_ok: bool,
+    reason: str,
+    note: str = "",
+    by: str = "",
     photo: str | None = None,
-) -> Decision:  # fmt: skip
+) -> Decision:
     """Add a decision about a component of the inspection of a folder or file, and check what it says.
 
     It is about the newest measurement of the component. A photo of a re-check is kept as ``recheck/NN/NAME``; one that

@@ -63,9 +63,15 @@ class DecisionLog:
         return self.path.with_suffix(".torn.jsonl")
 
     def decide(
-        self, component: str, is_ok: bool, reason: str, note: str = "", by: str = "", photo: str | None = None,
+        self,
+        component: str,
+        is_ok: bool,
+        reason: str,
+        note: str = "",
+        by: str = "",
+        photo: str | None = None,
         inspection_sha256: str = "",
-    ) -> Decision:  # fmt: skip
+    ) -> Decision:
         """Add a decision about a component: whether it is taken as it is, why, and by whom.
 
         Raises:
@@ -76,12 +82,17 @@ class DecisionLog:
         if type(is_ok) is not bool:
             raise InputError("is_ok: expected true or false")
         entry = Decision(
-            number=0, kind="decision", time=_now(), by=checked_name(by, "by"),
-            component=checked_name(component, "component"), is_ok=is_ok,
-            reason=checked_text(reason, "reason", required=not is_ok), note=checked_text(note, "note"),
+            number=0,
+            kind="decision",
+            time=_now(),
+            by=checked_name(by, "by"),
+            component=checked_name(component, "component"),
+            is_ok=is_ok,
+            reason=checked_text(reason, "reason", required=not is_ok),
+            note=checked_text(note, "note"),
             photo=None if photo is None else checked_name(photo, "photo"),
             inspection_sha256=_checked_hash(inspection_sha256),
-        )  # fmt: skip
+        )
         return self._append(entry)
 
     def tick(self, component: str, step: int, is_done: bool, by: str) -> Decision:
@@ -96,9 +107,14 @@ class DecisionLog:
         if type(is_done) is not bool:
             raise InputError("is_done: expected true or false")
         entry = Decision(
-            number=0, kind="tick", time=_now(), by=checked_name(by, "by"),
-            component=checked_name(component, "component"), step=step, is_done=is_done,
-        )  # fmt: skip
+            number=0,
+            kind="tick",
+            time=_now(),
+            by=checked_name(by, "by"),
+            component=checked_name(component, "component"),
+            step=step,
+            is_done=is_done,
+        )
         return self._append(entry)
 
     def sign(self, by: str, note: str = "", inspection_sha256: str = "", rechecks: Sequence[str] = ()) -> Decision:
@@ -117,10 +133,14 @@ class DecisionLog:
         if not inspection_sha256:
             raise InputError("sign: the fingerprint of the inspection is missing")
         entry = Decision(
-            number=0, kind="signature", time=_now(), by=checked_name(by, "by"),
-            note=checked_text(note, "note"), inspection_sha256=_checked_hash(inspection_sha256),
+            number=0,
+            kind="signature",
+            time=_now(),
+            by=checked_name(by, "by"),
+            note=checked_text(note, "note"),
+            inspection_sha256=_checked_hash(inspection_sha256),
             rechecks=tuple(_checked_hash(one) for one in rechecks),
-        )  # fmt: skip
+        )
         return self._append(entry)
 
     def entries(self) -> tuple[Decision, ...]:

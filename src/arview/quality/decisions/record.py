@@ -194,9 +194,12 @@ def _sentence(content: LogContent, signature: Signature | None, is_released: boo
 
 
 def _tail(
-    inspection: Inspection, accepted: Sequence[Decision], rejected: Sequence[Decision],
-    undecided: Sequence[ComponentDeviation], checked: Sequence[CheckedAgain],
-) -> list[str]:  # fmt: skip
+    inspection: Inspection,
+    accepted: Sequence[Decision],
+    rejected: Sequence[Decision],
+    undecided: Sequence[ComponentDeviation],
+    checked: Sequence[CheckedAgain],
+) -> list[str]:
     """What was put right, accepted, rejected and left open."""
     parts = []
     right = [one.after.name for one in checked if one.after.verdict is Verdict.PASS]

@@ -9,9 +9,22 @@ from collections.abc import Sequence
 from arview.quality.decisions.entry import Decision, stamp
 
 HEADER = (
-    "part", "serial", "entry", "time_utc", "kind", "component", "decision", "reason", "by", "note", "photo", "step",
-    "is_done", "inspection_sha256", "sha256",
-)  # fmt: skip
+    "part",
+    "serial",
+    "entry",
+    "time_utc",
+    "kind",
+    "component",
+    "decision",
+    "reason",
+    "by",
+    "note",
+    "photo",
+    "step",
+    "is_done",
+    "inspection_sha256",
+    "sha256",
+)
 """Columns. Cells that an entry of its kind does not have are empty."""
 
 
@@ -22,10 +35,22 @@ def decisions_csv(entries: Sequence[Decision], part: str = "", serial: str = "")
     writer.writerow(HEADER)
     for one in entries:
         cells = (
-            part, serial, str(one.number), stamp(one.time), one.kind, one.component, decision_word(one), one.reason,
-            one.by, one.note, one.photo or "", "" if one.step is None else str(one.step),
-            "" if one.is_done is None else str(one.is_done).lower(), one.inspection_sha256, one.sha256,
-        )  # fmt: skip
+            part,
+            serial,
+            str(one.number),
+            stamp(one.time),
+            one.kind,
+            one.component,
+            decision_word(one),
+            one.reason,
+            one.by,
+            one.note,
+            one.photo or "",
+            "" if one.step is None else str(one.step),
+            "" if one.is_done is None else str(one.is_done).lower(),
+            one.inspection_sha256,
+            one.sha256,
+        )
         writer.writerow([_text(cell) for cell in cells])
     return out.getvalue()
 

@@ -64,8 +64,14 @@ def _individuals(axes: Any, series: ComponentSeries, chart: ControlChart | None)
     marked = sorted(signals)
     axes.plot(places[marked], x[marked], "D", color=_RED, markersize=6, zorder=4)
     for index in marked[:12]:
-        axes.annotate(series.values[index].serial or f"#{series.values[index].result_id}", (places[index], x[index]),
-                      xytext=(5, 6), textcoords="offset points", fontsize=8, color=_RED)  # fmt: skip
+        axes.annotate(
+            series.values[index].serial or f"#{series.values[index].result_id}",
+            (places[index], x[index]),
+            xytext=(5, 6),
+            textcoords="offset points",
+            fontsize=8,
+            color=_RED,
+        )
     axes.set_ylabel(f"{series.quantity}, {series.unit}")
     axes.margins(x=0.02, y=0.14)
 
@@ -89,8 +95,16 @@ def _tolerance(axes: Any, series: ComponentSeries) -> None:
 def _ranges(axes: Any, series: ComponentSeries, chart: ControlChart | None) -> None:
     x = np.array([one.value for one in series.values])
     places = np.arange(2, len(x) + 1)
-    axes.plot(places, np.abs(np.diff(x)), "-o", color="#9db4cb", markerfacecolor=_BLUE, markeredgecolor=_BLUE,
-              markersize=3.5, linewidth=0.9)  # fmt: skip
+    axes.plot(
+        places,
+        np.abs(np.diff(x)),
+        "-o",
+        color="#9db4cb",
+        markerfacecolor=_BLUE,
+        markeredgecolor=_BLUE,
+        markersize=3.5,
+        linewidth=0.9,
+    )
     if chart is not None:
         axes.axhline(chart.range_center, color=_BLUE, linewidth=0.9)
         axes.axhline(chart.range_upper, color=_BLUE, linewidth=0.9, linestyle=(0, (5, 3)))
@@ -107,8 +121,17 @@ def _ranges(axes: Any, series: ComponentSeries, chart: ControlChart | None) -> N
 def _label(axes: Any, y: float, text: str, color: str) -> None:
     """Label a horizontal line at its right end."""
     text = text.replace("-", "−")
-    axes.annotate(text, (1.0, y), xycoords=("axes fraction", "data"), xytext=(4, 0), textcoords="offset points",
-                  va="center", fontsize=8, color=color, annotation_clip=False)  # fmt: skip
+    axes.annotate(
+        text,
+        (1.0, y),
+        xycoords=("axes fraction", "data"),
+        xytext=(4, 0),
+        textcoords="offset points",
+        va="center",
+        fontsize=8,
+        color=color,
+        annotation_clip=False,
+    )
 
 
 def _title(series: ComponentSeries, ability: Capability | None) -> str:

@@ -38,23 +38,44 @@ def new_rows(
 
 def _row(result_id: int, one: Decision) -> dict[str, Any]:
     return {
-        "result_id": result_id, "number": one.number, "kind": one.kind, "time": stamp(one.time), "by": one.by,
-        "component": one.component, "is_ok": None if one.is_ok is None else int(one.is_ok), "reason": one.reason,
-        "note": one.note, "photo": one.photo, "step": one.step,
-        "is_done": None if one.is_done is None else int(one.is_done), "inspection_sha256": one.inspection_sha256,
-        "rechecks": " ".join(one.rechecks), "previous": one.previous, "sha256": one.sha256,
-    }  # fmt: skip
+        "result_id": result_id,
+        "number": one.number,
+        "kind": one.kind,
+        "time": stamp(one.time),
+        "by": one.by,
+        "component": one.component,
+        "is_ok": None if one.is_ok is None else int(one.is_ok),
+        "reason": one.reason,
+        "note": one.note,
+        "photo": one.photo,
+        "step": one.step,
+        "is_done": None if one.is_done is None else int(one.is_done),
+        "inspection_sha256": one.inspection_sha256,
+        "rechecks": " ".join(one.rechecks),
+        "previous": one.previous,
+        "sha256": one.sha256,
+    }
 
 
 def decision_of_row(row: Any) -> Decision:
     """The entry that a row of the store holds."""
     return Decision(
-        number=int(row.number), kind=row.kind, time=datetime.fromisoformat(row.time), by=row.by,
-        component=row.component, is_ok=None if row.is_ok is None else bool(row.is_ok), reason=row.reason,
-        note=row.note, photo=row.photo, step=row.step, is_done=None if row.is_done is None else bool(row.is_done),
-        inspection_sha256=row.inspection_sha256, rechecks=tuple(row.rechecks.split()), previous=row.previous,
+        number=int(row.number),
+        kind=row.kind,
+        time=datetime.fromisoformat(row.time),
+        by=row.by,
+        component=row.component,
+        is_ok=None if row.is_ok is None else bool(row.is_ok),
+        reason=row.reason,
+        note=row.note,
+        photo=row.photo,
+        step=row.step,
+        is_done=None if row.is_done is None else bool(row.is_done),
+        inspection_sha256=row.inspection_sha256,
+        rechecks=tuple(row.rechecks.split()),
+        previous=row.previous,
         sha256=row.sha256,
-    )  # fmt: skip
+    )
 
 
 def decided_faults(entries: Sequence[Decision]) -> list[str]:

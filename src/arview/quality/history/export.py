@@ -13,10 +13,31 @@ from arview.quality.decisions.table import decision_word
 from arview.quality.history.store import HistoryStore, StoredResult
 
 HEADER = (
-    "result", "content_hash", "part", "serial", "station", "measured_utc", "added_utc", "part_verdict", "component",
-    "verdict", "finding", "dx_mm", "dy_mm", "dz_mm", "distance_mm", "U_mm", "tolerance_mm", "tilt_deg", "twist_deg",
-    "decision", "decision_reason", "decision_by", "decision_utc", "record",
-)  # fmt: skip
+    "result",
+    "content_hash",
+    "part",
+    "serial",
+    "station",
+    "measured_utc",
+    "added_utc",
+    "part_verdict",
+    "component",
+    "verdict",
+    "finding",
+    "dx_mm",
+    "dy_mm",
+    "dz_mm",
+    "distance_mm",
+    "U_mm",
+    "tolerance_mm",
+    "tilt_deg",
+    "twist_deg",
+    "decision",
+    "decision_reason",
+    "decision_by",
+    "decision_utc",
+    "record",
+)
 
 
 def to_csv(store: HistoryStore, found: Sequence[StoredResult]) -> bytes:
@@ -40,11 +61,23 @@ def to_csv(store: HistoryStore, found: Sequence[StoredResult]) -> bytes:
     for row in store.components([one.id for one in found]):
         one = by_id[row["result_id"]]
         writer.writerow(
-            [one.id, one.content_hash, _text(one.part), _text(one.serial), _text(one.station),
-             f"{one.measured:%Y-%m-%dT%H:%M:%SZ}", f"{one.added:%Y-%m-%dT%H:%M:%SZ}", one.verdict, _text(row["name"]),
-             row["verdict"], row["finding"] or "", *_numbers(row), *_decided(latest.get((one.id, row["name"]))),
-             _text(records.get(one.id, ""))]
-        )  # fmt: skip
+            [
+                one.id,
+                one.content_hash,
+                _text(one.part),
+                _text(one.serial),
+                _text(one.station),
+                f"{one.measured:%Y-%m-%dT%H:%M:%SZ}",
+                f"{one.added:%Y-%m-%dT%H:%M:%SZ}",
+                one.verdict,
+                _text(row["name"]),
+                row["verdict"],
+                row["finding"] or "",
+                *_numbers(row),
+                *_decided(latest.get((one.id, row["name"]))),
+                _text(records.get(one.id, "")),
+            ]
+        )
     return out.getvalue().encode("utf-8")
 
 

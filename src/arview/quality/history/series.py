@@ -122,9 +122,15 @@ def limits_text(one: SeriesValue) -> str:
 
 
 def series_of(
-    store: HistoryStore, component: str, quantity: Quantity = "distance", part: str | None = None,
-    station: str | None = None, since: datetime | None = None, repeats: bool = False, revisions: bool = False,
-) -> ComponentSeries:  # fmt: skip
+    store: HistoryStore,
+    component: str,
+    quantity: Quantity = "distance",
+    part: str | None = None,
+    station: str | None = None,
+    since: datetime | None = None,
+    repeats: bool = False,
+    revisions: bool = False,
+) -> ComponentSeries:
     """A quantity of a component, for the newest CAD model in the store, or for all with ``revisions``.
 
     Of a serial number that was measured several times only the last measurement counts, unless ``repeats``. Each value

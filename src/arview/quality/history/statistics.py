@@ -181,9 +181,19 @@ def capability(
         if share > MAX_MEASUREMENT_SHARE:
             warnings.append(f"{share:.0%} of the variance is due to the measurement, not to the parts")
     return Capability(
-        count, mean, std, lower, upper, cp, cp_interval, cpk, (cpk - spread, cpk + spread), chart.is_in_control, share,
+        count,
+        mean,
+        std,
+        lower,
+        upper,
+        cp,
+        cp_interval,
+        cpk,
+        (cpk - spread, cpk + spread),
+        chart.is_in_control,
+        share,
         tuple(warnings),
-    )  # fmt: skip
+    )
 
 
 def capability_by_limits(series: ComponentSeries) -> dict[tuple[float | None, float | None], Capability | InputError]:

@@ -109,8 +109,11 @@ def drawing_svg(part: Part, inspection: Inspection, component: str) -> str:
     told = {one.component: one for one in instructions(part, inspection)}
     subject = _subject(part, deviation, told.get(component))
     low, high = _extent(subject)
-    scale = min(1.0, _scale_for(PLAN_WIDTH_MM, high[0] - low[0] + 2.0 * MARGIN_MM),
-                _scale_for(MAX_PLAN_HEIGHT_MM, high[1] - low[1] + 2.0 * MARGIN_MM))  # fmt: skip
+    scale = min(
+        1.0,
+        _scale_for(PLAN_WIDTH_MM, high[0] - low[0] + 2.0 * MARGIN_MM),
+        _scale_for(MAX_PLAN_HEIGHT_MM, high[1] - low[1] + 2.0 * MARGIN_MM),
+    )
     height = float(np.clip((high[1] - low[1] + 2.0 * MARGIN_MM) * scale, MIN_PLAN_HEIGHT_MM, MAX_PLAN_HEIGHT_MM))
     top, pieces = _head(subject, inspection)
     plan = _Panel(0.3, top, PLAN_WIDTH_MM, height, 0.5 * (low + high), scale)
@@ -209,9 +212,11 @@ def _framed(panel: _Panel, key: str, pieces: list[str]) -> list[str]:
     """Pieces that are cut at the edge of their panel, and its frame."""
     box = f'x="{panel.x:g}" y="{panel.y:g}" width="{panel.width:g}" height="{panel.height:g}"'
     return [
-        f'<clipPath id="{key}"><rect {box}/></clipPath><g clip-path="url(#{key})">', *pieces, "</g>",
+        f'<clipPath id="{key}"><rect {box}/></clipPath><g clip-path="url(#{key})">',
+        *pieces,
+        "</g>",
         f'<rect {box} fill="none" stroke="{svg.PALE}" stroke-width="0.25"/>',
-    ]  # fmt: skip
+    ]
 
 
 def _outlines(subject: _Subject, panel: _Panel, with_others: bool) -> list[str]:

@@ -80,7 +80,7 @@ def _instruction(one: ComponentDeviation, part: Part, targets: Sequence[Target])
         steps = _filled(install, one.name, "", place)
         return Instruction(
             one.name, "install", "install it", text=settings.text, steps=steps, place=place, pictures=settings.pictures
-        )  # fmt: skip
+        )
     correction = correction_of(one, standing)
     names = names_for(standing, part, targets, settings)
     moves = _moves(one, standing, correction, names, part)
@@ -274,9 +274,13 @@ def _shims(
 
 
 def _remark(
-    one: ComponentDeviation, standing: Standing, correction: Correction, names: _Names,
-    moves: Sequence[ReworkMove], turn: ReworkTurn | None,
-) -> str:  # fmt: skip
+    one: ComponentDeviation,
+    standing: Standing,
+    correction: Correction,
+    names: _Names,
+    moves: Sequence[ReworkMove],
+    turn: ReworkTurn | None,
+) -> str:
     """What is not known, and what the distances refer to."""
     sentences = []
     normal = standing.normal_in_model

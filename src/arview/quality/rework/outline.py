@@ -52,8 +52,11 @@ MAX_FACES = 400_000
 
 
 def visible_lines(
-    shown: Sequence[Component], hiding: Sequence[Component], view: ParallelView, window: Window,
-) -> list[Array]:  # fmt: skip
+    shown: Sequence[Component],
+    hiding: Sequence[Component],
+    view: ParallelView,
+    window: Window,
+) -> list[Array]:
     """Polylines (K,2), mm in the drawing plane, of what is visible of components in a window.
 
     Args:

@@ -76,17 +76,16 @@ def scale_bar(x: float, y: float, length_mm: float, magnification: float) -> str
     drawn = length_mm * magnification
     ticks = [np.array([[x, y - 1.0], [x, y], [x + drawn, y], [x + drawn, y - 1.0]])]
     label = f"{length_mm:g} mm"
-    return path(ticks, f'stroke="{INK}" stroke-width="0.35"') + text(
-        x + drawn + 1.2, y, label, 2.5, f'fill="{INK}"'
-    )  # fmt: skip
+    return path(ticks, f'stroke="{INK}" stroke-width="0.35"') + text(x + drawn + 1.2, y, label, 2.5, f'fill="{INK}"')
 
 
 def cross(center: Array, size: float, color: str) -> str:
     """A diagonal cross."""
     x, y = center
     lines = [
-        np.array([[x - size, y - size], [x + size, y + size]]), np.array([[x - size, y + size], [x + size, y - size]])
-    ]  # fmt: skip
+        np.array([[x - size, y - size], [x + size, y + size]]),
+        np.array([[x - size, y + size], [x + size, y - size]]),
+    ]
     return path(lines, f'stroke="{color}" stroke-width="0.45"')
 
 

@@ -79,12 +79,20 @@ def instruction_document(one: Instruction) -> dict[str, Any]:
         "how": one.how,
         "what": one.what,
         "moves": [
-            {"text": move.text, "axis_in_model": list(move.axis_in_model), "distance_mm": move.distance_mm,
-             "U_mm": move.uncertainty_mm}
+            {
+                "text": move.text,
+                "axis_in_model": list(move.axis_in_model),
+                "distance_mm": move.distance_mm,
+                "U_mm": move.uncertainty_mm,
+            }
             for move in one.moves
         ],
-        "turn": None if turn is None else {
-            "text": turn.text, "axis_in_model": list(turn.axis_in_model), "angle_deg": turn.angle_deg,
+        "turn": None
+        if turn is None
+        else {
+            "text": turn.text,
+            "axis_in_model": list(turn.axis_in_model),
+            "angle_deg": turn.angle_deg,
             "U_deg": turn.uncertainty_deg,
         },
         "text": one.text,
@@ -92,4 +100,4 @@ def instruction_document(one: Instruction) -> dict[str, Any]:
         "remark": one.remark,
         "place": one.place,
         "pictures": list(one.pictures),
-    }  # fmt: skip
+    }

@@ -118,8 +118,13 @@ def targets_of(part: Part, absent: Sequence[str] = (), wrong: Sequence[str] = ()
 
 
 def lateral_directions(
-    part: Part, targets: Sequence[Target], component: str, center: Array, normal: Array, seat: str,
-) -> list[NamedDirection]:  # fmt: skip
+    part: Part,
+    targets: Sequence[Target],
+    component: str,
+    center: Array,
+    normal: Array,
+    seat: str,
+) -> list[NamedDirection]:
     """Directions across a normal that have a name, seen from a point.
 
     Args:
@@ -175,8 +180,11 @@ def across(vector: Array, normal: Array) -> Array:
 
 
 def in_named_steps(
-    vector: Array, declared: Sequence[NamedDirection], found: Sequence[NamedDirection], sideways: float,
-) -> list[NamedStep]:  # fmt: skip
+    vector: Array,
+    declared: Sequence[NamedDirection],
+    found: Sequence[NamedDirection],
+    sideways: float,
+) -> list[NamedStep]:
     """A vector across the seat's normal as one or two steps along directions that have a name.
 
     One step is taken along the vector itself, called by a direction near it, if following the name exactly would leave

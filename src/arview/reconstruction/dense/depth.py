@@ -159,9 +159,16 @@ def _layout(images: list[NDArray[np.float32]]) -> NDArray[np.int32]:
 
 
 def _search(
-    views: list[DenseView], greys: list[Floats], maps: list[Planes], sparse: SparseModel, cad: Cad | None,
-    options: DenseOptions, stage: int, device: str | None, index: int,
-) -> Planes:  # fmt: skip
+    views: list[DenseView],
+    greys: list[Floats],
+    maps: list[Planes],
+    sparse: SparseModel,
+    cad: Cad | None,
+    options: DenseOptions,
+    stage: int,
+    device: str | None,
+    index: int,
+) -> Planes:
     """PatchMatch of one view at one level; ``maps`` are those of the previous level, or empty."""
     view, step = views[index], STEPS[stage]
     height, width = greys[index].shape
@@ -182,15 +189,32 @@ def _search(
     planes, costs = np.zeros((height, width, 3), np.float32), np.empty((height, width), np.float32)
     scratch, indices = make_scratch(is_dense=stage > 0)
     try_hypotheses(
-        problem, scratch, indices, planes, costs, np.stack(given), np.float32(spread), randoms,
-        np.float32(low), np.float32(high), seed,
-    )  # fmt: skip
+        problem,
+        scratch,
+        indices,
+        planes,
+        costs,
+        np.stack(given),
+        np.float32(spread),
+        randoms,
+        np.float32(low),
+        np.float32(high),
+        seed,
+    )
     for turn, (step_w, step_tilt) in enumerate(steps):
         for color in (0, 1):
             sweep(
-                problem, scratch, indices, planes, costs, NEIGHBOURS, color,
-                np.float32(step_w), np.float32(step_tilt), seed + 101 * (turn + 1),
-            )  # fmt: skip
+                problem,
+                scratch,
+                indices,
+                planes,
+                costs,
+                NEIGHBOURS,
+                color,
+                np.float32(step_w),
+                np.float32(step_tilt),
+                seed + 101 * (turn + 1),
+            )
     return planes
 
 

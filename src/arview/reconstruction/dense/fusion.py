@@ -75,9 +75,11 @@ class _Stack:
 
 
 def fuse(
-    maps: Sequence[DepthMap], images: Sequence[Image], threads: int,
+    maps: Sequence[DepthMap],
+    images: Sequence[Image],
+    threads: int,
     progress: Progress,
-) -> DenseCloud:  # fmt: skip
+) -> DenseCloud:
     """Fuse depth maps into the cloud of all points that ``options.min_views`` maps agree on.
 
     Args:
@@ -201,10 +203,15 @@ def _seen_at(j: Any, p0: Any, p1: Any, p2: Any, layout: Any, cameras: Any, poses
 
 @kernel(numpy_errors=True)
 def _merge(
-    i: int, neighbours: NDArray[np.int64], elements: NDArray[np.float32], layout: NDArray[np.int64],
-    cameras: NDArray[np.float64], poses: NDArray[np.float64], limits: NDArray[np.float64],
-    merged: NDArray[np.float32]
-) -> None:  # fmt: skip
+    i: int,
+    neighbours: NDArray[np.int64],
+    elements: NDArray[np.float32],
+    layout: NDArray[np.int64],
+    cameras: NDArray[np.float64],
+    poses: NDArray[np.float64],
+    limits: NDArray[np.float64],
+    merged: NDArray[np.float32],
+) -> None:
     """Write merged depth, its standard deviation and the number of views of each pixel of view i that enough confirm.
 
     ``limits``: agreement in px, relative depth, cosine of the normals' angle, number of views, spread in px.
@@ -250,9 +257,18 @@ def _merge(
                 against += shift > 0.0
                 continue
             here = _confirmed_depth(
-                elements, q, poses, i, j, (x, y, depth, shift), (ray0, ray1, ray2), (n0, n1, n2, length), centre,
-                (fx, fy, xn, yn, z), (agreement, relative, min_cosine),
-            )  # fmt: skip
+                elements,
+                q,
+                poses,
+                i,
+                j,
+                (x, y, depth, shift),
+                (ray0, ray1, ray2),
+                (n0, n1, n2, length),
+                centre,
+                (fx, fy, xn, yn, z),
+                (agreement, relative, min_cosine),
+            )
             if here > 0.0:
                 depths[views], weights[views] = here, 1.0 / max(elements[q, 3] * here**4, 1e-18 * z * z)
                 views += 1
@@ -267,9 +283,18 @@ def _merge(
 
 @kernel(numpy_errors=True, inline=True)
 def _confirmed_depth(
-    elements: Any, q: Any, poses: Any, i: Any, j: Any, seen: Any, ray: Any, normal: Any, centre: Any, pixel: Any,
-    limits: Any
-) -> Any:  # fmt: skip
+    elements: Any,
+    q: Any,
+    poses: Any,
+    i: Any,
+    j: Any,
+    seen: Any,
+    ray: Any,
+    normal: Any,
+    centre: Any,
+    pixel: Any,
+    limits: Any,
+) -> Any:
     """Depth along a pixel's ray at which the element of another view lies, or -1 where the two disagree.
 
     Args:

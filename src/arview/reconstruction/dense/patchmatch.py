@@ -46,10 +46,18 @@ def draw(seed: int, x: int, y: int, turn: int) -> float | np.float32:
 
 @kernel(fastmath=True)
 def try_hypotheses(
-    p: Problem, s: NDArray[np.float32], index: NDArray[np.int32], planes: NDArray[np.float32],
-    costs: NDArray[np.float32], hypotheses: NDArray[np.float32], spread: float | np.float32, randoms: int,
-    lowest: float | np.float32, highest: float | np.float32, seed: int
-) -> None:  # fmt: skip
+    p: Problem,
+    s: NDArray[np.float32],
+    index: NDArray[np.int32],
+    planes: NDArray[np.float32],
+    costs: NDArray[np.float32],
+    hypotheses: NDArray[np.float32],
+    spread: float | np.float32,
+    randoms: int,
+    lowest: float | np.float32,
+    highest: float | np.float32,
+    seed: int,
+) -> None:
     """Set each pixel to the best of given hypotheses (C,H,W,3) and of random ones.
 
     Random hypotheses are drawn within ``spread`` (in w) of the first given one, and between ``lowest`` and ``highest``.
@@ -84,7 +92,7 @@ def try_hypotheses(
                         dv = w / fy * draw(seed, x, y, turn + 2)
                 cost = element_cost(
                     pixels, maps, sizes, warps, numbers, s, index, at_x, at_y, w, du, dv, variance, costs[y, x]
-                )  # fmt: skip
+                )
                 if cost < costs[y, x]:
                     costs[y, x] = cost
                     planes[y, x, 0], planes[y, x, 1], planes[y, x, 2] = w, du, dv
@@ -92,10 +100,17 @@ def try_hypotheses(
 
 @kernel(fastmath=True)
 def sweep(
-    p: Problem, s: NDArray[np.float32], index: NDArray[np.int32], planes: NDArray[np.float32],
-    costs: NDArray[np.float32], regions: NDArray[np.int64], color: int, step_w: float | np.float32,
-    step_tilt: float | np.float32, seed: int
-) -> None:  # fmt: skip
+    p: Problem,
+    s: NDArray[np.float32],
+    index: NDArray[np.int32],
+    planes: NDArray[np.float32],
+    costs: NDArray[np.float32],
+    regions: NDArray[np.int64],
+    color: int,
+    step_w: float | np.float32,
+    step_tilt: float | np.float32,
+    seed: int,
+) -> None:
     """Half a checkerboard iteration: planes of the best neighbours, then a perturbation.
 
     ``step_w`` is the perturbation of w, ``step_tilt`` that of the slope (tangent).

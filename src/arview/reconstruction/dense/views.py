@@ -222,9 +222,15 @@ def render_cad(cad: Cad, cam_from_scan: Array, camera: Camera) -> tuple[Array, N
     """Inverse depth (H,W), 0 off the part, and face ids (H,W) of the CAD in an ideal camera."""
     vertices, faces, _ = cad.model.mesh
     return rasterise(
-        apply(cam_from_scan @ cad.scan_from_model, vertices), faces,
-        camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height,
-    )  # fmt: skip
+        apply(cam_from_scan @ cad.scan_from_model, vertices),
+        faces,
+        camera.fx,
+        camera.fy,
+        camera.cx,
+        camera.cy,
+        camera.width,
+        camera.height,
+    )
 
 
 def cad_planes(cad: Cad, cam_from_scan: Array, camera: Camera) -> Planes:

@@ -191,9 +191,11 @@ def find_cad(
     reasons: list[NotFound] = []
     for view_range in search_ranges(part, [photo.camera for photo in photos], SPANS):
         views = cached_guide_views(
-            part.model, view_range, GuideViewOptions(subdivisions=SUBDIVISIONS),
+            part.model,
+            view_range,
+            GuideViewOptions(subdivisions=SUBDIVISIONS),
             progress=lambda done, total: progress("guide views", done, total) if progress else None,
-        )  # fmt: skip
+        )
         votes, turns, reason = _search(photos, order, read, views, progress)
         if votes:
             return _refined(photos, order, read, part, votes, turns, options, progress)
@@ -288,8 +290,9 @@ def _refined(
     fit = refiner.refine(scored[0][1])
     support = refiner.support(fit.similarity, fit.samples)
     is_whole = max(support.score, support.base_score) >= MIN_SUPPORT
-    clear = [one.name for one, share in zip(model.components, support.by_component, strict=True)
-             if share >= CLEAR_SUPPORT]  # fmt: skip
+    clear = [
+        one.name for one, share in zip(model.components, support.by_component, strict=True) if share >= CLEAR_SUPPORT
+    ]
     if not is_whole and len(clear) >= MIN_CLEAR:
         warnings.append(
             f"only some of the part is in view: of the edges of {len(model.components)} components those of "

@@ -185,8 +185,10 @@ class JointRefiner:
             is_near = np.abs(rendering.depth_mm[v, u] - depth) < 2.0 * CONTACT_PX * depth / drawn.fx
             is_good &= ~((other >= 0) & (other != found.component) & is_near)
         points, tangents, component = (
-            found.points_in_model[is_good], found.tangents_in_model[is_good], found.component[is_good]
-        )  # fmt: skip
+            found.points_in_model[is_good],
+            found.tangents_in_model[is_good],
+            found.component[is_good],
+        )
         return CadEdgePoints(points, tangents, component, self._features(points, tangents, component))
 
     def rough(self, start: Similarity) -> tuple[Similarity, Support]:
@@ -273,21 +275,32 @@ class JointRefiner:
         is_found = seen & (slopes != 0.0)
         # Numerical derivative through the lens, with steps of one micrometre per mm of depth.
         delta = 1e-6 * in_cam[:, 2:]
-        by_cam = np.stack([
-            np.sum((view.camera.project(in_cam + delta * axis) - pixels) * normals, axis=1) / delta[:, 0]
-            for axis in np.eye(3)
-        ], axis=1)  # fmt: skip
+        by_cam = np.stack(
+            [
+                np.sum((view.camera.project(in_cam + delta * axis) - pixels) * normals, axis=1) / delta[:, 0]
+                for axis in np.eye(3)
+            ],
+            axis=1,
+        )
         by_model = by_cam @ cam_from_model[:3, :3]
-        rows = np.concatenate([
-            np.cross(samples.points - self.center, by_model), by_model,
-            (by_cam @ apply(cam_from_model, self.center))[:, None], np.sign(slopes)[:, None],
-        ], axis=1)  # fmt: skip
+        rows = np.concatenate(
+            [
+                np.cross(samples.points - self.center, by_model),
+                by_model,
+                (by_cam @ apply(cam_from_model, self.center))[:, None],
+                np.sign(slopes)[:, None],
+            ],
+            axis=1,
+        )
         count = len(self._is_base)
         return EdgeResiduals(
-            rows[is_found], offsets[is_found], samples.component[is_found], samples.feature[is_found],
+            rows[is_found],
+            offsets[is_found],
+            samples.component[is_found],
+            samples.feature[is_found],
             np.bincount(samples.component[seen], minlength=count),
             np.bincount(samples.component[is_found & (np.abs(offsets) < 0.5 * reach_px)], minlength=count),
-        )  # fmt: skip
+        )
 
     def measure_all(
         self, start: Similarity, samples: Sequence[CadEdgePoints], reach_px: float, shift_px: float = 0.0
@@ -388,9 +401,7 @@ class _JointSystem:
         The cluster-robust estimate (Liang & Zeger 1986), summed over these three groupings of the residuals.
         """
         total = np.zeros((8, 8))
-        for labels, rows in (
-            (self.view, self.projected), (self.feature, self.projected), (self.component, self.rows)
-        ):  # fmt: skip
+        for labels, rows in ((self.view, self.projected), (self.feature, self.projected), (self.component, self.rows)):
             groups, inverse = np.unique(labels, return_inverse=True)
             if len(groups) < 2:
                 continue

@@ -127,8 +127,10 @@ def _side_px(corners_by_photo: Sequence[dict[CornerKey, Array]], tags: Tags) -> 
     """Median side length, in the photos, of the tags of a dictionary."""
     sides = [
         float(np.linalg.norm(corners[key] - corners[(*key[:2], 1)]))
-        for corners in corners_by_photo for key in corners if key[0] == tags.dictionary and key[2] == 0
-    ]  # fmt: skip
+        for corners in corners_by_photo
+        for key in corners
+        if key[0] == tags.dictionary and key[2] == 0
+    ]
     return float(np.median(sides)) if sides else 1.0
 
 

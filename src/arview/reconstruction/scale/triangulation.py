@@ -62,8 +62,9 @@ def triangulate_corners(
     index = {key: i for i, key in enumerate(keys)}
     views: list[CornerSightings] = [
         (camera, pose, np.array([index[k] for k in corners], dtype=np.intp), np.array(list(corners.values())))
-        for camera, pose, corners in zip(cameras, cams_from_scan, corners_by_photo, strict=True) if corners
-    ]  # fmt: skip
+        for camera, pose, corners in zip(cameras, cams_from_scan, corners_by_photo, strict=True)
+        if corners
+    ]
     points, good = _linear_points(views, len(keys), MIN_ANGLE_DEG)
     normal = np.zeros((len(keys), 3, 3))
     sigma_px = np.inf

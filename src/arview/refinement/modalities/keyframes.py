@@ -91,9 +91,12 @@ def to_camera(m: Any, x: Any, y: Any, z: Any) -> Any:
 
 @kernel
 def tangent_jacobian(
-    point: NDArray[np.float64], tangents: NDArray[np.float64], cam_from_body: NDArray[np.float64],
-    intrinsics: NDArray[np.float64], out: NDArray[np.float64]
-) -> tuple[float, float, float]:  # fmt: skip
+    point: NDArray[np.float64],
+    tangents: NDArray[np.float64],
+    cam_from_body: NDArray[np.float64],
+    intrinsics: NDArray[np.float64],
+    out: NDArray[np.float64],
+) -> tuple[float, float, float]:
     """Pixel u, v and depth of a point; depth -1 behind the camera.
 
     Fills ``out`` (2,2) with px per mm along the two tangents, by central differences over about 4 px.
@@ -235,9 +238,11 @@ def _place_corners(
 
 @kernel
 def _all_jacobians(
-    points: NDArray[np.float64], tangents: NDArray[np.float64], cam_from_body: NDArray[np.float64],
-    intrinsics: NDArray[np.float64]
-) -> NDArray[np.float64]:  # fmt: skip
+    points: NDArray[np.float64],
+    tangents: NDArray[np.float64],
+    cam_from_body: NDArray[np.float64],
+    intrinsics: NDArray[np.float64],
+) -> NDArray[np.float64]:
     """Jacobians (N,2,2) of all points, see `tangent_jacobian`."""
     jacobians = np.empty((points.shape[0], 2, 2))
     for i in range(points.shape[0]):
@@ -275,9 +280,16 @@ def make_keyframe(
     corners = _best_corners(response, _RESPONSE * CORNER_CONTRAST**2, cell)
     corners = 2.0 * corners[np.argsort(-corners[:, 2]), :2] + (left, top)
     used, kept, points, tangents = _place_corners(
-        caster.hierarchy, invert(cam_from_body), corners, intrinsics, MARGIN_PX, CORNER_DISTANCE_PX,
-        FLATNESS_PX, MIN_FACING, MAX_CORNERS,
-    )  # fmt: skip
+        caster.hierarchy,
+        invert(cam_from_body),
+        corners,
+        intrinsics,
+        MARGIN_PX,
+        CORNER_DISTANCE_PX,
+        FLATNESS_PX,
+        MIN_FACING,
+        MAX_CORNERS,
+    )
     if used < MIN_CORNERS:
         return None
     points, tangents = points[:used].copy(), tangents[:used].copy()

@@ -187,9 +187,15 @@ def crop_for_shading(
 
 @kernel
 def refine_by_shading(
-    crop: ShadingCrop, surface: Surface, corners: NDArray[np.float32], diameter_mm: float,
-    cam_from_body: NDArray[np.float64], information: NDArray[np.float64], gain: float, rounds: int
-) -> ShadedPose:  # fmt: skip
+    crop: ShadingCrop,
+    surface: Surface,
+    corners: NDArray[np.float32],
+    diameter_mm: float,
+    cam_from_body: NDArray[np.float64],
+    information: NDArray[np.float64],
+    gain: float,
+    rounds: int,
+) -> ShadedPose:
     """Refine a pose by the shading of the part's surface, see `ShadedPose`.
 
     Args:
@@ -256,9 +262,15 @@ def _is_determined(information: NDArray[np.float64]) -> bool:
 
 @kernel
 def _smooth_normals(
-    drawn: NDArray[np.float32], face_ids: NDArray[np.int32], surface: Surface, corners: NDArray[np.float32],
-    pose: NDArray[np.float64], focal_px: NDArray[np.float64], middle_px: NDArray[np.float64], diameter_mm: float
-) -> None:  # fmt: skip
+    drawn: NDArray[np.float32],
+    face_ids: NDArray[np.int32],
+    surface: Surface,
+    corners: NDArray[np.float32],
+    pose: NDArray[np.float64],
+    focal_px: NDArray[np.float64],
+    middle_px: NDArray[np.float64],
+    diameter_mm: float,
+) -> None:
     """Replace the normals of the faces by interpolated normals of their corners (Phong, CACM 1975), in place."""
     points, faces = surface[0], surface[1]
     place, normal = np.empty(3), np.empty(3)
@@ -334,7 +346,7 @@ def _harmonics(x: float | np.float32, y: float | np.float32, z: float | np.float
 @kernel
 def _fit_light(
     values: NDArray[np.float64], functions: NDArray[np.float64], light: NDArray[np.float64], is_known: bool
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:  # fmt: skip
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Light (9,) that explains grey levels (N,) best, and their robust weights (N,) (Geman & McClure).
 
     Args:
@@ -366,9 +378,15 @@ def _weigh(residuals: NDArray[np.float64], weights: NDArray[np.float64]) -> None
 
 @kernel
 def _jacobian(
-    places: NDArray[np.int64], light: NDArray[np.float64], drawn: NDArray[np.float32], face_ids: NDArray[np.int32],
-    pose: NDArray[np.float64], focal_px: NDArray[np.float64], middle_px: NDArray[np.float64], diameter_mm: float
-) -> NDArray[np.float64]:  # fmt: skip
+    places: NDArray[np.int64],
+    light: NDArray[np.float64],
+    drawn: NDArray[np.float32],
+    face_ids: NDArray[np.int32],
+    pose: NDArray[np.float64],
+    focal_px: NDArray[np.float64],
+    middle_px: NDArray[np.float64],
+    diameter_mm: float,
+) -> NDArray[np.float64]:
     """Derivative (N,6) of the brightness at each pixel with respect to the twist, see `gauss_newton`.
 
     A moved surface shows another of its points at a pixel, and the normal of that point is turned.
@@ -414,9 +432,12 @@ def _jacobian(
 
 @kernel
 def _reduce_system(
-    motion: NDArray[np.float64], functions: NDArray[np.float64], values: NDArray[np.float64],
-    weights: NDArray[np.float64], light: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:  # fmt: skip
+    motion: NDArray[np.float64],
+    functions: NDArray[np.float64],
+    values: NDArray[np.float64],
+    weights: NDArray[np.float64],
+    light: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
     """System (6,6), (6,) of the pose with the light eliminated, and the share of the variance that is explained.
 
     The system is divided by the residual variance of the brightness.

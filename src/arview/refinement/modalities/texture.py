@@ -193,9 +193,15 @@ class TextureModality:
             neighbour_px=NEIGHBOUR_PX,
         )
         matches = match_texture(
-            keyframe.pyramid, pyramid, keyframe.anchors, self._caster.hierarchy, cam_from_body, self._intrinsics,
-            self._damping, settings,
-        )  # fmt: skip
+            keyframe.pyramid,
+            pyramid,
+            keyframe.anchors,
+            self._caster.hierarchy,
+            cam_from_body,
+            self._intrinsics,
+            self._damping,
+            settings,
+        )
         found = np.flatnonzero(matches.weights > 0.0)
         self._last = (keyframe, found, matches.pixels[found])
         tried = int(np.count_nonzero(matches.expected))

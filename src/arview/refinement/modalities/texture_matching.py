@@ -52,7 +52,7 @@ COARSE_NCC = 0.6
 @kernel
 def _agree_with_neighbours(
     predicted: NDArray[np.float64], pixels: NDArray[np.float64], weights: NDArray[np.float64], limit_px: float
-) -> None:  # fmt: skip
+) -> None:
     """Clear the weights of points whose displacement differs from the median of their nearest neighbours."""
     count = predicted.shape[0]
     near = NEIGHBOURS
@@ -94,10 +94,16 @@ def _agree_with_neighbours(
 
 @kernel
 def add_matches(
-    hessian: NDArray[np.float64], gradient: NDArray[np.float64], points: NDArray[np.float64],
-    cam_from_body: NDArray[np.float64], intrinsics: NDArray[np.float64], pixels: NDArray[np.float64],
-    weights: NDArray[np.float64], sigma_px: float, robust_px: float
-) -> tuple[float, float, int]:  # fmt: skip
+    hessian: NDArray[np.float64],
+    gradient: NDArray[np.float64],
+    points: NDArray[np.float64],
+    cam_from_body: NDArray[np.float64],
+    intrinsics: NDArray[np.float64],
+    pixels: NDArray[np.float64],
+    weights: NDArray[np.float64],
+    sigma_px: float,
+    robust_px: float,
+) -> tuple[float, float, int]:
     """Add the reprojection residuals of matched points to the 6×6 system.
 
     Args:
@@ -138,9 +144,14 @@ def add_matches(
 
 @kernel
 def align_pose(
-    points: NDArray[np.float64], cam_from_body: NDArray[np.float64], intrinsics: NDArray[np.float64],
-    pixels: NDArray[np.float64], weights: NDArray[np.float64], damping: NDArray[np.float64], sigma_px: float
-) -> NDArray[np.float64]:  # fmt: skip
+    points: NDArray[np.float64],
+    cam_from_body: NDArray[np.float64],
+    intrinsics: NDArray[np.float64],
+    pixels: NDArray[np.float64],
+    weights: NDArray[np.float64],
+    damping: NDArray[np.float64],
+    sigma_px: float,
+) -> NDArray[np.float64]:
     """Pose (4,4) that projects points on their pixels; the robust limit shrinks from 40 to 3 px."""
     hessian = np.zeros((6, 6))
     gradient = np.zeros(6)
@@ -156,9 +167,13 @@ def align_pose(
 
 @kernel
 def _count_near(
-    points: NDArray[np.float64], cam_from_body: NDArray[np.float64], intrinsics: NDArray[np.float64],
-    pixels: NDArray[np.float64], weights: NDArray[np.float64], limit_px: float
-) -> int:  # fmt: skip
+    points: NDArray[np.float64],
+    cam_from_body: NDArray[np.float64],
+    intrinsics: NDArray[np.float64],
+    pixels: NDArray[np.float64],
+    weights: NDArray[np.float64],
+    limit_px: float,
+) -> int:
     """Number of points of positive weight that project to within ``limit_px`` of their pixels."""
     count = 0
     for i in range(points.shape[0]):
@@ -173,7 +188,7 @@ def _count_near(
 @kernel
 def _find_visible(
     anchors: Anchors, hierarchy: Hierarchy, cam_from_body: NDArray[np.float64], settings: MatchSettings
-) -> NDArray[np.bool_]:  # fmt: skip
+) -> NDArray[np.bool_]:
     """Whether each trusted anchor (N,) faces the camera and is not hidden behind the part itself."""
     r = cam_from_body
     eye = np.empty(3)
@@ -203,9 +218,15 @@ def _find_visible(
 
 @kernel
 def _predict(
-    anchors: Anchors, cam_from_body: NDArray[np.float64], intrinsics: NDArray[np.float64], width: int, height: int,
-    wanted: NDArray[np.bool_], predicted: NDArray[np.float64], warps: NDArray[np.float64]
-) -> None:  # fmt: skip
+    anchors: Anchors,
+    cam_from_body: NDArray[np.float64],
+    intrinsics: NDArray[np.float64],
+    width: int,
+    height: int,
+    wanted: NDArray[np.bool_],
+    predicted: NDArray[np.float64],
+    warps: NDArray[np.float64],
+) -> None:
     """Fill the predicted pixels (N,2) and the warps (N,2,2) of the tangent planes from frame to keyframe px.
 
     Clears ``wanted`` (N,) where the patch is outside the picture or much larger or smaller than in the keyframe.
@@ -235,10 +256,16 @@ def _predict(
 
 @kernel
 def _align_level(
-    level: int, key_pyramid: tuple[NDArray[np.uint8], ...], pyramid: tuple[NDArray[np.uint8], ...],
-    key_pixels: NDArray[np.float64], warps: NDArray[np.float64], wanted: NDArray[np.bool_], min_ncc: float,
-    pixels: NDArray[np.float64], scores: NDArray[np.float64]
-) -> None:  # fmt: skip
+    level: int,
+    key_pyramid: tuple[NDArray[np.uint8], ...],
+    pyramid: tuple[NDArray[np.uint8], ...],
+    key_pixels: NDArray[np.float64],
+    warps: NDArray[np.float64],
+    wanted: NDArray[np.bool_],
+    min_ncc: float,
+    pixels: NDArray[np.float64],
+    scores: NDArray[np.float64],
+) -> None:
     """Align the wanted patches on one level, starting at ``pixels`` (N,2) in place; fills scores (N,), 0 = failed."""
     side = PATCH_SIDE
     patch = np.empty((side + 2, side + 2), dtype=np.float32)
@@ -266,10 +293,15 @@ def _align_level(
 
 @kernel
 def match_texture(
-    key_pyramid: tuple[NDArray[np.uint8], ...], pyramid: tuple[NDArray[np.uint8], ...], anchors: Anchors,
-    hierarchy: Hierarchy, cam_from_body: NDArray[np.float64], intrinsics: NDArray[np.float64],
-    damping: NDArray[np.float64], settings: MatchSettings
-) -> PatchMatches:  # fmt: skip
+    key_pyramid: tuple[NDArray[np.uint8], ...],
+    pyramid: tuple[NDArray[np.uint8], ...],
+    anchors: Anchors,
+    hierarchy: Hierarchy,
+    cam_from_body: NDArray[np.float64],
+    intrinsics: NDArray[np.float64],
+    damping: NDArray[np.float64],
+    settings: MatchSettings,
+) -> PatchMatches:
     """Find the corners of a keyframe in a new frame, see `PatchMatches`.
 
     All patches are first shifted together on the coarsest level, then aligned one by one on level 2. If these agree on

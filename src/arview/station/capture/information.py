@@ -66,8 +66,11 @@ class Views:
 
     @staticmethod
     def of(
-        points: Array, is_seen: NDArray[np.bool_], centers: Array, focal_px: float,
-    ) -> Views:  # fmt: skip
+        points: Array,
+        is_seen: NDArray[np.bool_],
+        centers: Array,
+        focal_px: float,
+    ) -> Views:
         """The views of cameras at some places.
 
         Args:
@@ -107,9 +110,10 @@ class KnownViews:
         self._nearest = np.concatenate([self._nearer(cosines[None])[0], own.T[None]])
         old = self.views
         self.views = Views(
-            np.concatenate([old.information, view.information]), np.concatenate([old.rays, view.rays]),
+            np.concatenate([old.information, view.information]),
+            np.concatenate([old.rays, view.rays]),
             np.concatenate([old.is_seen, view.is_seen]),
-        )  # fmt: skip
+        )
 
     def information(self) -> Array:
         """(C,3,3) of all photos together and of what is known before."""
@@ -134,9 +138,7 @@ class KnownViews:
     def _nearer(self, cosines: Array) -> Array:
         """(V,N,C,2) nearest and second nearest with each one of some views (V,N,C) added."""
         first, second = self._nearest[..., 0], self._nearest[..., 1]
-        return np.stack(
-            [np.maximum(first, cosines), np.maximum(np.minimum(first, cosines), second)], axis=-1
-        )  # fmt: skip
+        return np.stack([np.maximum(first, cosines), np.maximum(np.minimum(first, cosines), second)], axis=-1)
 
     def _weights(self, cosines: Array) -> Array:
         """Weights of photos by the cosines to their second nearest one."""

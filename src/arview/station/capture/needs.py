@@ -198,9 +198,14 @@ class CaptureNeeds:
             return
         views, directions = self._dome.views[cells], self._dome.directions[cells]
         order = choose_views(
-            self._known.views, views, self._weights, directions, self._directions,
-            min(len(cells), o.max_photos - self.photos), MAX_STEP_DEG,
-        )  # fmt: skip
+            self._known.views,
+            views,
+            self._weights,
+            directions,
+            self._directions,
+            min(len(cells), o.max_photos - self.photos),
+            MAX_STEP_DEG,
+        )
         self.best_gain = float(gains(self._known, views, self._weights).max())
         self.plan = self._until_enough([int(cells[index]) for index in order])
 

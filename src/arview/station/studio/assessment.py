@@ -45,9 +45,15 @@ class Assessment:
         views, unique = self.views, self.unique
         weak = self.weak_words()
         rows = zip(
-            views.directions.tolist(), azimuths_deg(views).tolist(), elevations_deg(views).tolist(),
-            unique.distinct_lines.tolist(), unique.likeness.tolist(), unique.confused_with.tolist(), weak, strict=True,
-        )  # fmt: skip
+            views.directions.tolist(),
+            azimuths_deg(views).tolist(),
+            elevations_deg(views).tolist(),
+            unique.distinct_lines.tolist(),
+            unique.likeness.tolist(),
+            unique.confused_with.tolist(),
+            weak,
+            strict=True,
+        )
         return {
             "is_sufficient": unique.is_sufficient,
             "reason": unique.reason,
@@ -173,9 +179,11 @@ def advice(part: Part, whole: Model) -> list[dict[str, Any]]:
                 view_range.distance_mm, (low, high), view_range.azimuth_deg, view_range.roll_deg, up=view_range.up
             )
             value = {
-                "distance_mm": list(over.distance_mm), "elevation_deg": [low, high],
-                "azimuth_deg": list(over.azimuth_deg), "roll_deg": list(over.roll_deg),
-            }  # fmt: skip
+                "distance_mm": list(over.distance_mm),
+                "elevation_deg": [low, high],
+                "azimuth_deg": list(over.azimuth_deg),
+                "roll_deg": list(over.roll_deg),
+            }
             attempt(
                 f"look {text}: elevation {low:g} to {high:g}°", part.model, over, {"kind": "view_range", "value": value}
             )

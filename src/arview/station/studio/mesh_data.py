@@ -42,9 +42,13 @@ def mesh_bytes(model: Model, is_coarse: bool) -> bytes:
     lines, edge_ranges = ([], [[0, 0]] * len(ranges)) if is_coarse else _crease_lines(model)
     edge_count = sum(count for _, count in edge_ranges)
     header = {
-        "vertices": first_vertex, "faces": first_face, "edges": edge_count,
-        "ranges": ranges, "edge_ranges": edge_ranges, "is_coarse": is_coarse,
-    }  # fmt: skip
+        "vertices": first_vertex,
+        "faces": first_face,
+        "edges": edge_count,
+        "ranges": ranges,
+        "edge_ranges": edge_ranges,
+        "is_coarse": is_coarse,
+    }
     text = json.dumps(header).encode()
     text += b" " * (-len(text) % 4)
     arrays = [np.concatenate(points), np.concatenate(corners), np.concatenate([*lines, np.zeros((0, 3), np.float32)])]

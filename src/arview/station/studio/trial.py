@@ -87,9 +87,12 @@ class Trials:
         self._draw(part, camera, images[shown.index], shown)
         components = {name: str(one.presence) for name, one in poses[-1].components.items()}
         return {
-            "frames": len(poses), "tracked": len(tracked), "quality": shown.quality,
-            "reason": next((pose.reason for pose in reversed(poses) if pose.reason), ""), "components": components,
-        }  # fmt: skip
+            "frames": len(poses),
+            "tracked": len(tracked),
+            "quality": shown.quality,
+            "reason": next((pose.reason for pose in reversed(poses) if pose.reason), ""),
+            "components": components,
+        }
 
     def _draw(self, part: Part, camera: Camera, image: Image, pose: Pose) -> None:
         drawn = OverlayRenderer(part.model, camera).draw(image, pose)

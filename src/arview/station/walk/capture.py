@@ -85,10 +85,18 @@ def open_folder(folder: Path, part: Part, serial: str | None, camera: str | None
     except OSError as error:
         raise OutputError(f"{folder}: cannot be made ({error.strerror or error})") from error
     document = {
-        "format": FORMAT, "version": VERSION, "id": folder.resolve().name, "part": str(part.path.resolve()),
-        "part_name": part.name, "model_hash": part.model.source_hash, "serial": serial or "",
-        "created": datetime.now(UTC).isoformat(), "camera": camera, "parent": None, "components": None,
-    }  # fmt: skip
+        "format": FORMAT,
+        "version": VERSION,
+        "id": folder.resolve().name,
+        "part": str(part.path.resolve()),
+        "part_name": part.name,
+        "model_hash": part.model.source_hash,
+        "serial": serial or "",
+        "created": datetime.now(UTC).isoformat(),
+        "camera": camera,
+        "parent": None,
+        "components": None,
+    }
     if serial:
         write_file(folder / "job.json", (json.dumps(document, ensure_ascii=False, indent=1) + "\n").encode())
     return JobFolder(folder, document)

@@ -74,9 +74,7 @@ class JobFolder:
     document: Mapping[str, Any]
 
     @staticmethod
-    def create(
-        jobs: Path, part: Part, part_path: str | Path, serial: str, camera: str | None = None
-    ) -> JobFolder:  # fmt: skip
+    def create(jobs: Path, part: Part, part_path: str | Path, serial: str, camera: str | None = None) -> JobFolder:
         """Make the folder of a new job.
 
         Args:
@@ -97,10 +95,18 @@ class JobFolder:
         name = f"{_safe(part.name)}_{_safe(serial)}_{now:%Y%m%dT%H%M%S}"
         folder, job_id = _new_folder(Path(jobs), name)
         document = {
-            "format": FORMAT, "version": VERSION, "id": job_id, "part": str(Path(part_path).resolve()),
-            "part_name": part.name, "model_hash": part.model.source_hash, "serial": serial,
-            "created": now.isoformat(), "camera": camera, "parent": None, "components": None,
-        }  # fmt: skip
+            "format": FORMAT,
+            "version": VERSION,
+            "id": job_id,
+            "part": str(Path(part_path).resolve()),
+            "part_name": part.name,
+            "model_hash": part.model.source_hash,
+            "serial": serial,
+            "created": now.isoformat(),
+            "camera": camera,
+            "parent": None,
+            "components": None,
+        }
         return _written(folder, document)
 
     @staticmethod
@@ -147,9 +153,13 @@ class JobFolder:
     # --- photos ------------------------------------------------------------------------------------------
 
     def add_photo(
-        self, content: bytes, sha256: str, source: PhotoOrigin = "upload", hint: Mapping[str, Any] | None = None,
+        self,
+        content: bytes,
+        sha256: str,
+        source: PhotoOrigin = "upload",
+        hint: Mapping[str, Any] | None = None,
         taken: str | datetime | None = None,
-    ) -> str:  # fmt: skip
+    ) -> str:
         """Store a photo; it is on the disk when this returns.
 
         Args:
@@ -311,9 +321,11 @@ class JobFolder:
             raise InputError(f"check again: {', '.join(unknown) or 'no component'}; known are {', '.join(names)}")
         folder, number = _new_folder(first.path / "recheck", "")
         document = dict(first.document) | {
-            "id": f"{first.id}_r{number}", "created": utc_now(), "parent": first.id,
+            "id": f"{first.id}_r{number}",
+            "created": utc_now(),
+            "parent": first.id,
             "components": [name for name in names if name in components],
-        }  # fmt: skip
+        }
         return _written(folder, document)
 
     def rechecks(self) -> list[JobFolder]:
@@ -346,8 +358,11 @@ def start_worker(job: JobFolder) -> subprocess.Popen[bytes]:
         with (job.path / "worker.log").open("ab") as log:
             return subprocess.Popen(
                 [sys.executable, "-m", "arview.station.walk", str(job.path)],
-                stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True,
-            )  # fmt: skip
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+                start_new_session=True,
+            )
     except OSError as error:
         raise _cannot_write(job.path, error) from error
 

@@ -75,7 +75,7 @@ class PhotoPreparation:
             kept("picture", newest, lambda: read_photo(newest))
             intake = reconstruct(
                 paths, self.job.path / "rough" / "photos", None, self.prepared.job.camera, options
-            ).intake  # fmt: skip
+            ).intake
             sparse = options.sparse
             features, remarks = moving_features(intake.photos, sparse, self.threads, _nothing, self.memory)
             min_move_px = MAX_SHIFT_PX if remarks else 0.0

@@ -115,9 +115,13 @@ class RecheckWorker(WalkWorker):
         metric = MetricReconstruction(sparse.transformed(scale, frame), self.scale, None)
         try:
             found = measure_again(
-                metric, prepared.part, self.job.components or (), [photo.name for photo in new], prepared.measure,
+                metric,
+                prepared.part,
+                self.job.components or (),
+                [photo.name for photo in new],
+                prepared.measure,
                 progress=self._progress(),
-            )  # fmt: skip
+            )
         except InputError as error:
             raise CannotMeasureError(str(error)) from error
         inspection = self._whole(found, prepared.part, sparse.unplaced)
@@ -147,9 +151,11 @@ class RecheckWorker(WalkWorker):
         note = f"re-check of {', '.join(measured)}, registered to the datums of {first}"
         left_out = tuple(f"{Path(name).name}: {reason}" for name, reason in unplaced)
         return replace(
-            found, components=tuple(components), warnings=(*found.warnings, *left_out),
+            found,
+            components=tuple(components),
+            warnings=(*found.warnings, *left_out),
             provenance=replace(found.provenance, tool="arview walk", note=note),
-        )  # fmt: skip
+        )
 
     def _say_verdict(self, inspection: Inspection, was_done: bool) -> None:
         checked = tuple(one for one in inspection.components if one.name in (self.job.components or ()))

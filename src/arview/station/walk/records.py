@@ -99,9 +99,13 @@ def photo_of_line(document: Any) -> StoredPhoto:
     """The photo of a line of ``photos.jsonl``. Raises InputError when it is none."""
     try:
         photo = StoredPhoto(
-            str(document["name"]), str(document["sha256"]), int(document["bytes"]), str(document["taken"]),
-            document["source"], checked_hint(document.get("hint")),
-        )  # fmt: skip
+            str(document["name"]),
+            str(document["sha256"]),
+            int(document["bytes"]),
+            str(document["taken"]),
+            document["source"],
+            checked_hint(document.get("hint")),
+        )
     except (KeyError, TypeError, ValueError) as error:
         raise InputError("is no photo of a job") from error
     if (

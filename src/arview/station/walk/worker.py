@@ -127,9 +127,14 @@ class WalkWorker:
 
         try:
             found = reconstruct(
-                photo_files(self.job, photos), folder, prepared.part, prepared.job.camera, options, progress=tell,
+                photo_files(self.job, photos),
+                folder,
+                prepared.part,
+                prepared.job.camera,
+                options,
+                progress=tell,
                 memory=self.memory,
-            )  # fmt: skip
+            )
             inspection = measured_in_photos(found, prepared, tell)
         except (_WalkEndedError, ArviewError):
             return False
@@ -138,9 +143,11 @@ class WalkWorker:
         save_inspection(inspection, folder / "inspection.json")
         placed = len(found.sparse.photos) if found.sparse is not None else 0
         self._say(
-            placed=placed, is_rough=True, inspection="rough/inspection.json",
+            placed=placed,
+            is_rough=True,
+            inspection="rough/inspection.json",
             text=f"{len(self.job.photos())} photos; provisional numbers from {count}",
-        )  # fmt: skip
+        )
         return True
 
     # --- after the end -----------------------------------------------------------------------------------
@@ -182,9 +189,15 @@ class WalkWorker:
         if not was_done and ended is not None:
             seconds = round((datetime.now(UTC) - ended).total_seconds(), 2)
         self._say(
-            stage="done", text=verdict_sentence(inspection), is_rough=False, inspection="inspection.json",
-            placed=inspection.provenance.photos, seconds_after_last_photo=seconds, cloud="running", step="",
-        )  # fmt: skip
+            stage="done",
+            text=verdict_sentence(inspection),
+            is_rough=False,
+            inspection="inspection.json",
+            placed=inspection.provenance.photos,
+            seconds_after_last_photo=seconds,
+            cloud="running",
+            step="",
+        )
 
     def _report(self, part: Part) -> None:
         """Write the report of what is measured."""
@@ -246,10 +259,15 @@ def prepared_of(job: JobFolder) -> Prepared:
     """
     document = job.document
     prepared = prepare(
-        InspectJob(str(document["part"]), str(job.path / "photos"), serial=job.serial, camera=document.get("camera"),
-                   makes_pdf=False),
+        InspectJob(
+            str(document["part"]),
+            str(job.path / "photos"),
+            serial=job.serial,
+            camera=document.get("camera"),
+            makes_pdf=False,
+        ),
         job.path,
-    )  # fmt: skip
+    )
     if prepared.part.model.source_hash != document["model_hash"]:
         raise MismatchError(f"{document['part']}: has changed since job {job.id} was made; make a new job")
     return prepared

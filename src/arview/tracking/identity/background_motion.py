@@ -122,9 +122,7 @@ class BackgroundMotion:
         poses = [] if self._first_pose is None else [self._outline.moved(self._first_pose, self._known())]
         poses += [] if cam_from_model is None else [cam_from_model]
         mask = self._outline.mask(poses, before.scale, before.gray.shape[:2], 0.05)
-        corners = cv2.goodFeaturesToTrack(
-            before.gray, MAX_CORNERS, MIN_CORNER_QUALITY, CORNER_SPACING_PX, mask=mask
-        )  # fmt: skip
+        corners = cv2.goodFeaturesToTrack(before.gray, MAX_CORNERS, MIN_CORNER_QUALITY, CORNER_SPACING_PX, mask=mask)
         if corners is None or len(corners) < MIN_INLIERS:
             return None
         window = (WINDOW_PX, WINDOW_PX)

@@ -80,7 +80,7 @@ class SpecimenSearch:
 
     def others(
         self, image: NDArray[np.uint8], known: Array, finders: Finders, is_thorough: bool = False
-    ) -> list[Array]:  # fmt: skip
+    ) -> list[Array]:
         """Poses (4,4) of the part in an image (H,W,3) uint8 RGB, apart from a known one (4,4)."""
         place = self._outline.place(known)
         picture = hide_specimens(image, [known], self._outline.views, self._outline.camera)
@@ -89,7 +89,7 @@ class SpecimenSearch:
 
     def at_place(
         self, image: NDArray[np.uint8], guess: Array, finders: Finders, is_turned: bool = False
-    ) -> Array | None:  # fmt: skip
+    ) -> Array | None:
         """The pose (4,4) of a part at the place of a rough pose (4,4); None without one there.
 
         Args:

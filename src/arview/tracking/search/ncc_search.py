@@ -87,9 +87,12 @@ class StoredViews(NamedTuple):
     def first(self, count: int) -> StoredViews:
         """The first views."""
         return StoredViews(
-            self.rotations[:count], self.pictures[:count], self.masks[:count], self.templates[:count],
+            self.rotations[:count],
+            self.pictures[:count],
+            self.masks[:count],
+            self.templates[:count],
             self.weights[:count],
-        )  # fmt: skip
+        )
 
 
 class AppearanceMatch(NamedTuple):
@@ -287,9 +290,14 @@ class NccSearch:
 
 @kernel(fastmath=True)
 def _correlation(
-    image: NDArray[np.float32], picture: NDArray[np.uint8], mask: NDArray[np.uint8], u: float, v: float, roll: float,
-    ratio: float
-) -> float:  # fmt: skip
+    image: NDArray[np.float32],
+    picture: NDArray[np.uint8],
+    mask: NDArray[np.uint8],
+    u: float,
+    v: float,
+    roll: float,
+    ratio: float,
+) -> float:
     """Masked normalised correlation of a view with an image, all channels together; -1 mostly outside the image.
 
     The view is placed with its centre at (u, v) px, turned by ``roll`` rad and scaled by ``ratio``. Pixels outside the
@@ -334,9 +342,13 @@ def _correlation(
 
 @kernel
 def pattern_search(
-    image: NDArray[np.float32], picture: NDArray[np.uint8], mask: NDArray[np.uint8], start: NDArray[np.float64],
-    steps: NDArray[np.float64], halvings: int
-) -> tuple[float, NDArray[np.float64]]:  # fmt: skip
+    image: NDArray[np.float32],
+    picture: NDArray[np.uint8],
+    mask: NDArray[np.uint8],
+    start: NDArray[np.float64],
+    steps: NDArray[np.float64],
+    halvings: int,
+) -> tuple[float, NDArray[np.float64]]:
     """Pattern search (Hooke & Jeeves, 1961) for the best correlation of a view.
 
     Args:

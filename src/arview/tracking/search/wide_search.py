@@ -96,9 +96,18 @@ class WideSearch:
 
         def score(turns: Array) -> tuple[Array, Array]:
             return score_around(
-                maps, self._part, start, intrinsics, step_mm, turns, self._stretches, shift_px,
-                SHIFT_STEP_PX, POINTS, POINTS,
-            )  # fmt: skip
+                maps,
+                self._part,
+                start,
+                intrinsics,
+                step_mm,
+                turns,
+                self._stretches,
+                shift_px,
+                SHIFT_STEP_PX,
+                POINTS,
+                POINTS,
+            )
 
         found = list(pool().map(score, np.array_split(self._turns, 2)))
         scores, poses = np.concatenate([f[0] for f in found]), np.concatenate([f[1] for f in found])
@@ -124,9 +133,20 @@ class WideSearch:
 
         def search(starts: Array) -> tuple[Array, Array]:
             return search_poses(
-                maps, self._part, starts, intrinsics, 0.01 * self._diameter_mm, np.deg2rad(turn_deg), stretch,
-                2, 1, 2, 1, points, points,
-            )  # fmt: skip
+                maps,
+                self._part,
+                starts,
+                intrinsics,
+                0.01 * self._diameter_mm,
+                np.deg2rad(turn_deg),
+                stretch,
+                2,
+                1,
+                2,
+                1,
+                points,
+                points,
+            )
 
         # Alternate poses go to the two threads, because the best ones take longer.
         results = list(pool().map(search, [np.ascontiguousarray(poses[k::2]) for k in range(2) if len(poses[k::2])]))
@@ -138,9 +158,13 @@ class WideSearch:
         scores, poses = scores[order], poses[order]
         reach = np.full(len(poses), 0.01 * separation_deg * self._diameter_mm) / poses[:, 2, 3]
         chosen = select_distinct(
-            np.ascontiguousarray(poses[:, :3, :3]), np.ascontiguousarray(poses[:, :3, 3]), reach,
-            np.cos(np.deg2rad(separation_deg)), 1.0 + 0.01 * separation_deg, max_count,
-        )  # fmt: skip
+            np.ascontiguousarray(poses[:, :3, :3]),
+            np.ascontiguousarray(poses[:, :3, 3]),
+            reach,
+            np.cos(np.deg2rad(separation_deg)),
+            1.0 + 0.01 * separation_deg,
+            max_count,
+        )
         return scores[chosen], np.ascontiguousarray(poses[chosen])
 
     def _maps(

@@ -176,9 +176,7 @@ class FocalAdjustment:
         view = nearest_view(arrays.directions, pose)
         chosen = slice(arrays.edge_starts[view], arrays.edge_starts[view + 1])
         points, tangents, kinds = arrays.edge_points[chosen], arrays.edge_tangents[chosen], arrays.edge_kinds[chosen]
-        lines = project_lines(
-            points, tangents, True, pose, frame.intrinsics(camera), 0.01 * self._diameter_mm
-        )  # fmt: skip
+        lines = project_lines(points, tangents, True, pose, frame.intrinsics(camera), 0.01 * self._diameter_mm)
         reach = max(5, round(min(REACH, 2.5 * spread_px + 2.0)))
         profiles = measure_edges(frame.gray, lines, reach, STEP_PX, THRESHOLD)
         return _Measured(points, tangents, kinds, lines, profiles)
@@ -188,9 +186,16 @@ class FocalAdjustment:
     ) -> EdgeEquations:
         """Equations of a frame; the columns of the principal point are in pixels of the whole frame."""
         equations = edge_equations(
-            measured.points, measured.kinds, pose, frame.intrinsics(camera), measured.lines, measured.profiles,
-            spread_px, STRENGTH_HALF, SMOOTH_WEIGHT,
-        )  # fmt: skip
+            measured.points,
+            measured.kinds,
+            pose,
+            frame.intrinsics(camera),
+            measured.lines,
+            measured.profiles,
+            spread_px,
+            STRENGTH_HALF,
+            SMOOTH_WEIGHT,
+        )
         equations.jacobian[:, POSE_COLUMNS + 1 : POSE_COLUMNS + 3] *= frame.scale
         return equations
 

@@ -11,6 +11,12 @@ from arview.measurement.cloud.reading.units import (
 )
 
 __all__ = [
-    "SUFFIXES", "UNITS_MM", "USUAL_UNITS", "RawPoints", "check_given_unit", "possible_units",
-    "read_points", "unit_of_option",
-]  # fmt: skip
+    "SUFFIXES",
+    "UNITS_MM",
+    "USUAL_UNITS",
+    "RawPoints",
+    "check_given_unit",
+    "possible_units",
+    "read_points",
+    "unit_of_option",
+]

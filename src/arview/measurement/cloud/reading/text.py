@@ -236,9 +236,7 @@ def _names(line: str) -> list[str]:
     return [name.strip(" \"'").lower() for name in re.split(r"[,;\t|]|\s+", line) if name.strip(" \"'")]
 
 
-def _columns_by_name(
-    names: list[str], columns: int
-) -> tuple[tuple[int, int, int], tuple[int, int, int] | None]:  # fmt: skip
+def _columns_by_name(names: list[str], columns: int) -> tuple[tuple[int, int, int], tuple[int, int, int] | None]:
     """Columns of x y z and of the normal by their names."""
 
     def places(wanted: tuple[str, ...]) -> tuple[int, int, int] | None:

@@ -196,9 +196,14 @@ class Uploads:
             raise Refusal(400, "bad_request", "hint: expected an object")
         try:
             return Upload(
-                _name_of(sha256, purpose), size, sha256, source, checked_hint(hint), checked_time(request.get("taken")),
+                _name_of(sha256, purpose),
+                size,
+                sha256,
+                source,
+                checked_hint(hint),
+                checked_time(request.get("taken")),
                 purpose=purpose,
-            )  # fmt: skip
+            )
         except InputError as error:
             raise Refusal(400, "bad_request", str(error)) from error
 

@@ -362,9 +362,7 @@ class JobHandlers:
             raise Refusal(507, "disk_full", _without_folders(str(error), self._desk)) from error
 
     async def _json(self, request: Request) -> dict[str, Any]:
-        return await json_body(
-            request, TEXT_BYTES, BODY_TIMEOUT_S
-        )  # fmt: skip
+        return await json_body(request, TEXT_BYTES, BODY_TIMEOUT_S)
 
 
 def _photo_file(job: JobFolder, name: str) -> Path | None:

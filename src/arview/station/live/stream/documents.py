@@ -100,9 +100,14 @@ def evidence_document(pose: Pose, subject: Subject | None) -> Document:
             continue
         center = component.bounds_in_model.mean(axis=0)
         text = label_text(
-            component.name, deviation, presence, options, center_in_model=center, doubt=doubt,
+            component.name,
+            deviation,
+            presence,
+            options,
+            center_in_model=center,
+            doubt=doubt,
             is_pending=component.name in subject.pending,
-        )  # fmt: skip
+        )
         moved = None if presence is None else presence.model_from_nominal
         document["labels"].append(
             {

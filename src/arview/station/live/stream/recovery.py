@@ -59,10 +59,15 @@ def recovered_frames(part: Path, target: Path) -> int:
     unfinished = target.with_name(f".{target.name}.recovering")
     count = 0
     try:
-        with av.open(str(part.absolute())) as source, av.open(
-            str(unfinished.absolute()), "w", format=CONTAINERS[target.suffix.lower()],
-            options={"movflags": "+faststart"},
-        ) as copy:  # fmt: skip
+        with (
+            av.open(str(part.absolute())) as source,
+            av.open(
+                str(unfinished.absolute()),
+                "w",
+                format=CONTAINERS[target.suffix.lower()],
+                options={"movflags": "+faststart"},
+            ) as copy,
+        ):
             video = source.streams.video[0]
             stream = copy.add_stream_from_template(video)
             with suppress(av.FFmpegError):  # the cut
