@@ -191,7 +191,17 @@ def verify(
         )
     verdict = _verdict([one.verdict for one in results], held, limit is not None)
     return Verification(
-        measured.label, reference, limit, tuple(results), left_out, within, expected, is_shared, ratio, held, verdict
+        measured.label,
+        reference,
+        limit,
+        lengths=tuple(results),
+        left_out=left_out,
+        within=within,
+        expected=expected,
+        is_shared=is_shared,
+        ratio=ratio,
+        u_held=held,
+        verdict=verdict,
     )
 
 

@@ -77,7 +77,9 @@ def pick_features(component: Component, face: int, point_in_model: Array) -> lis
         found.append(cylinder)
     else:
         found.append(_plane(vertices, faces, normals, flat, face, point))
-    edge = _edge(vertices, faces, neighbours, normals, flat, point, reach_mm, SMOOTH_DEG)
+    edge = _edge(
+        vertices, faces, neighbours, normals=normals, flat=flat, point=point, reach_mm=reach_mm, sharp_deg=SMOOTH_DEG
+    )
     if edge is not None:
         found.append(edge)
     return found

@@ -200,7 +200,16 @@ def adjust(views: Sequence[BoardView], width: int, height: int, start: Camera | 
     ]
     covariance = _covariance(views, found, poses, residuals)
     rms = float(np.sqrt(np.mean(np.concatenate(residuals) ** 2)))
-    return Solution(found, covariance, tuple(views), poses, tuple(residuals), rms, {}, 0)
+    return Solution(
+        found,
+        covariance,
+        tuple(views),
+        cams_from_board=poses,
+        residuals=tuple(residuals),
+        rms_px=rms,
+        rejected={},
+        corners_left_out=0,
+    )
 
 
 def _adjust_brown(views: Sequence[BoardView], width: int, height: int, start: Camera | None) -> tuple[Camera, Array]:

@@ -135,13 +135,13 @@ def assess(solution: Solution) -> CalibrationVerdict:
         grade,
         focal_u,
         centre_u,
-        (float(np.nanmedian(pixel_u)), worst),
-        coverage,
-        cells,
-        (float(tilts.min()), float(np.median(tilts)), float(tilts.max())),
-        ratio,
-        tuple(why),
-        tuple(advice),
+        pixel_u_px=(float(np.nanmedian(pixel_u)), worst),
+        coverage=coverage,
+        cells=cells,
+        tilts_deg=(float(tilts.min()), float(np.median(tilts)), float(tilts.max())),
+        distance_ratio=ratio,
+        reasons=tuple(why),
+        advice=tuple(advice),
     )
 
 

@@ -122,4 +122,14 @@ def _entry(line: str) -> CameraEntry:
         raise InputError(f"camera {label}: {model} needs {expected} parameters, the file gives {len(params)}")
     fx, fy, cx, cy = (params[place] for place in places)
     dist, lens = simplest(LensDistortion(kind, tuple(params[place] for place in lens_places)))
-    return CameraEntry(fx, fy, cx - COLMAP_HALF_PX, cy - COLMAP_HALF_PX, dist, lens, width, height, label=label)
+    return CameraEntry(
+        fx,
+        fy,
+        cx - COLMAP_HALF_PX,
+        cy=cy - COLMAP_HALF_PX,
+        dist=dist,
+        lens=lens,
+        width=width,
+        height=height,
+        label=label,
+    )

@@ -263,7 +263,17 @@ def _read(node: Mapping[str, Any], label: str) -> CameraEntry:
     dist, lens = lens_from_terms(models, listed[0][1] if listed else None, named)
     fx, fy, cx, cy = _pinhole(matrices, numbers, width, height)
     return CameraEntry(
-        fx, fy, cx - half_px, cy - half_px, dist, lens, width, height, _roi(node), _binning(node), label=label
+        fx,
+        fy,
+        cx - half_px,
+        cy=cy - half_px,
+        dist=dist,
+        lens=lens,
+        width=width,
+        height=height,
+        roi=_roi(node),
+        binning=_binning(node),
+        label=label,
     )
 
 

@@ -160,7 +160,16 @@ def _cloud_alone(cloud: DenseCloud, warnings: tuple[str, ...], factors: tuple[fl
         none.astype(np.int32),
         np.zeros((0, 2)),
     )
-    scale = ScaleResult(1.0, None, None, None, (), warnings, "a cloud without photos", Consistency(True, ""))
+    scale = ScaleResult(
+        1.0,
+        None,
+        None,
+        covariance=None,
+        evidence=(),
+        warnings=warnings,
+        why_no_frame="a cloud without photos",
+        consistency=Consistency(True, ""),
+    )
     return MetricReconstruction(empty, scale, cloud, factors)
 
 

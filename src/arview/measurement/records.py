@@ -288,13 +288,13 @@ def datum_record(
             one.label,
             features.get(one.label, one.feature),
             components.get(one.label, base[0]),
-            one.locked,
-            one.used,
-            one.of,
-            one.residual_mm,
-            one.rest_mm,
-            one.radius_mm,
-            _datum_method(one, features) if reconstruction.sparse.photos else "cloud",
+            locked=one.locked,
+            used=one.used,
+            of=one.of,
+            residual_mm=one.residual_mm,
+            rest_mm=one.rest_mm,
+            radius_mm=one.radius_mm,
+            method=_datum_method(one, features) if reconstruction.sparse.photos else "cloud",
         )
         for one in alignment.datums
     )
@@ -307,13 +307,13 @@ def datum_record(
         reports,
         _matrix(alignment.rough_from_datum),
         _matrix(alignment.covariance),
-        _three(alignment.origin_in_model),
-        scale.scale,
-        scale.scale_std,
-        "; ".join(used),
-        notes,
-        failed,
-        "partial" if failed else "datums" if part.datums else "best_fit",
+        origin_mm=_three(alignment.origin_in_model),
+        mm_per_unit=scale.scale,
+        scale_std=scale.scale_std,
+        scale_from="; ".join(used),
+        notes=notes,
+        not_measured=failed,
+        frame="partial" if failed else "datums" if part.datums else "best_fit",
     )
 
 

@@ -253,7 +253,18 @@ def _rough_frame(origin: Array, size_mm: float) -> DatumEquations:
     """Equations of the rough frame of the reconstruction, for what neither datums nor base determine."""
     std = ROUGH_STD_MM
     covariance = np.diag([(std / size_mm) ** 2] * 3 + [std**2] * 3)
-    move = Move("part", "sweep", origin, np.zeros(6), covariance, np.zeros((0, 6)), size_mm, 0, 0.0, 1.0)
+    move = Move(
+        "part",
+        "sweep",
+        origin,
+        twist=np.zeros(6),
+        covariance=covariance,
+        undetermined=np.zeros((0, 6)),
+        radius_mm=size_mm,
+        used=0,
+        residual_mm=0.0,
+        support=1.0,
+    )
     return move_equations("the rough frame", move)[0]
 
 
@@ -288,13 +299,13 @@ def _as_move(name: str, together: CombinedMove) -> Move:
         name,
         "sweep",
         together.center_in_model,
-        together.twist,
-        covariance,
-        together.undetermined,
-        together.radius_mm,
-        0,
-        0.0,
-        1.0,
+        twist=together.twist,
+        covariance=covariance,
+        undetermined=together.undetermined,
+        radius_mm=together.radius_mm,
+        used=0,
+        residual_mm=0.0,
+        support=1.0,
     )
 
 

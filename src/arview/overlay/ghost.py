@@ -98,13 +98,13 @@ class Ghost:
             points,
             faces[:count],
             camera.fx,
-            camera.fy,
-            camera.cx,
-            camera.cy,
-            u1 - u0,
-            v1 - v0,
-            NEAR_MM,
-            (u0, v0),
+            fy=camera.fy,
+            cx=camera.cx,
+            cy=camera.cy,
+            width=u1 - u0,
+            height=v1 - v0,
+            near_mm=NEAR_MM,
+            origin=(u0, v0),
         )
         if self._ideal_pixels is not None:
             inverse_depth, face_ids = _look_up(self._ideal_pixels, window, (u0, v0), inverse_depth, face_ids)

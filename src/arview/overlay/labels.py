@@ -252,7 +252,9 @@ def label_text(
     notes = _with((), remark, doubt, note)
     is_dimmed = bool(remark or doubt)
     details = () if notes or verdict is Verdict.PASS else detail_parts(deviation)
-    return LabelText(name, value, word, notes, details, verdict, evidence, is_dimmed)
+    return LabelText(
+        name, value, word, notes=notes, details=details, verdict=verdict, evidence=evidence, is_dimmed=is_dimmed
+    )
 
 
 def displacement_texts(

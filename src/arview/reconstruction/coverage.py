@@ -118,7 +118,14 @@ def components_seen(model: Model, camera: Camera, cam_from_model: Array) -> list
         if enough:
             points = apply(cam_from_model, component.vertices_in_model)
             _, faces = rasterise(
-                points, component.faces, small.fx, small.fy, small.cx, small.cy, small.width, small.height
+                points,
+                component.faces,
+                small.fx,
+                fy=small.fy,
+                cx=small.cx,
+                cy=small.cy,
+                width=small.width,
+                height=small.height,
             )
             enough = bool(pixels >= MIN_SHARE * np.count_nonzero(faces >= 0))
         result.append(enough)

@@ -153,11 +153,11 @@ def _colmap_camera(camera: Any, folder: Path) -> Camera:
         camera.width,
         camera.height,
         p.get("fx", p.get("f", 0.0)),
-        p.get("fy", p.get("f", 0.0)),
-        p["cx"] - HALF_PX,
-        p["cy"] - HALF_PX,
-        p,
-        folder,
+        fy=p.get("fy", p.get("f", 0.0)),
+        cx=p["cx"] - HALF_PX,
+        cy=p["cy"] - HALF_PX,
+        terms=p,
+        path=folder,
     )
 
 
@@ -180,7 +180,7 @@ def _transforms_pose(entry: dict[str, Any], path: Path) -> GivenPose:
     fy = float(entry.get("fl_y") or fx)
     cx, cy = float(entry.get("cx", 0.5 * width)) - HALF_PX, float(entry.get("cy", 0.5 * height)) - HALF_PX
     world_from_cam = _rigid_of(np.array(entry["transform_matrix"], dtype=np.float64), path)
-    camera = _camera(width, height, fx, fy, cx, cy, entry, path)
+    camera = _camera(width, height, fx, fy=fy, cx=cx, cy=cy, terms=entry, path=path)
     return GivenPose(str(entry["file_path"]), camera, invert(world_from_cam @ _OPENGL_AXES))
 
 
@@ -230,11 +230,11 @@ def _metashape_camera(sensor: ElementTree.Element, path: Path) -> Camera:
         width,
         height,
         p["f"] + p.get("b1", 0.0),
-        p["f"],
-        0.5 * width + p.get("cx", 0.0) - HALF_PX,
-        0.5 * height + p.get("cy", 0.0) - HALF_PX,
-        terms,
-        path,
+        fy=p["f"],
+        cx=0.5 * width + p.get("cx", 0.0) - HALF_PX,
+        cy=0.5 * height + p.get("cy", 0.0) - HALF_PX,
+        terms=terms,
+        path=path,
     )
 
 

@@ -104,7 +104,17 @@ def placed_with_silhouettes(
     if not can_place_again:
         assert whole is not None
         return _with_remark(whole, _not_made(reason))
-    return _placed_by_part(photos, folder, masks_folder, silhouettes, place, tell, whole, failure, reason)
+    return _placed_by_part(
+        photos,
+        folder,
+        masks_folder,
+        silhouettes=silhouettes,
+        place=place,
+        tell=tell,
+        whole=whole,
+        failure=failure,
+        reason=reason,
+    )
 
 
 def _placed_by_part(

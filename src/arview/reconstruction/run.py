@@ -203,7 +203,9 @@ class _ReconstructionRun:
             key = key_of(key, self.options.dense)
             cloud = self._dense(sparse, cad, key)
         quality = None if sparse is None else quality_of(sparse, cloud)
-        result = Reconstruction(self.folder, intake, sparse, scale, cloud, cover, quality, self.seconds)
+        result = Reconstruction(
+            self.folder, intake, sparse, scale=scale, cloud=cloud, coverage=cover, quality=quality, seconds=self.seconds
+        )
         write_json(self.folder / "reconstruction.json", summary(result))
         return result
 

@@ -120,7 +120,14 @@ def _sees(
     ideal = camera.without_distortion()
     small = ideal.scaled(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
     inverse_depth, _ = rasterise(
-        apply(cam_from_model, vertices), faces, small.fx, small.fy, small.cx, small.cy, small.width, small.height
+        apply(cam_from_model, vertices),
+        faces,
+        small.fx,
+        fy=small.fy,
+        cx=small.cx,
+        cy=small.cy,
+        width=small.width,
+        height=small.height,
     )
     in_cam = apply(cam_from_model, middles)
     depth = in_cam[:, 2]

@@ -105,7 +105,9 @@ def reconstruct_sparse(
     known, memory = known or KnownPairs(), memory or SparseMemory()
     features, remarks = moving_features(photos, options, threads, tell, memory)
     min_move_px = MAX_SHIFT_PX if remarks else 0.0
-    tried, pairs = match_by_appearance(photos, features, options, threads, tell, min_move_px, known, memory)
+    tried, pairs = match_by_appearance(
+        photos, features, options, threads=threads, tell=tell, min_move_px=min_move_px, known=known, memory=memory
+    )
     write_pairs(folder / "pairs.json", photos, tried)
     database_path = folder / "database.db"
     write_database(database_path, photos, features, pairs, MIN_MATCHES, options.seed)

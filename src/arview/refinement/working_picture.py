@@ -161,7 +161,9 @@ def working_picture(
     own = camera if is_whole else camera.cropped(left, top, right - left, bottom - top)
     if scale != 1.0:
         own = own.scaled(gray.shape[1], gray.shape[0])
-    return WorkingPicture(np.asarray(colors), smoothed(np.asarray(gray)), own, scale, left, top, right, bottom)
+    return WorkingPicture(
+        np.asarray(colors), smoothed(np.asarray(gray)), own, scale=scale, left=left, top=top, right=right, bottom=bottom
+    )
 
 
 def matches_in(picture: WorkingPicture, matches: TextureMatches) -> TextureMatches:

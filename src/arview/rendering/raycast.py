@@ -180,8 +180,31 @@ def _build(
         cut = (first + last) // 2
         if spread > 0.0:
             to_bin = BINS * (1.0 - 1e-9) / spread
-            plane = _best_plane(low, high, order, first, last, axis, origin, to_bin, box, sizes, cost)
-            left = _partition(low, high, order, first, last, axis, origin, to_bin, plane, swap)
+            plane = _best_plane(
+                low,
+                high,
+                order,
+                first=first,
+                last=last,
+                axis=axis,
+                origin=origin,
+                to_bin=to_bin,
+                box=box,
+                sizes=sizes,
+                cost=cost,
+            )
+            left = _partition(
+                low,
+                high,
+                order,
+                first=first,
+                last=last,
+                axis=axis,
+                origin=origin,
+                to_bin=to_bin,
+                plane=plane,
+                swap=swap,
+            )
             if first < left < last:
                 cut = left
         links[node, 0], links[node, 1] = nodes, 0
@@ -289,12 +312,12 @@ def _cast_rays(
             hierarchy,
             origins[i, 0],
             origins[i, 1],
-            origins[i, 2],
-            directions[i, 0],
-            directions[i, 1],
-            directions[i, 2],
-            1e300,
-            False,
+            oz=origins[i, 2],
+            dx=directions[i, 0],
+            dy=directions[i, 1],
+            dz=directions[i, 2],
+            limit=1e300,
+            any_hit=False,
         )
         distances[i] = distance if face >= 0 else np.inf
         faces[i] = face

@@ -60,11 +60,11 @@ class ZBufferRenderer:
             apply(cam_from_model, self._vertices),
             self._faces,
             camera.fx,
-            camera.fy,
-            camera.cx,
-            camera.cy,
-            camera.width,
-            camera.height,
+            fy=camera.fy,
+            cx=camera.cx,
+            cy=camera.cy,
+            width=camera.width,
+            height=camera.height,
         )
         seen = face_ids >= 0
         depth = np.zeros(inverse_depth.shape, dtype=np.float32)

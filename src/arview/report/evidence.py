@@ -70,7 +70,9 @@ def gather(
     distances = _distances(inspection, source, part, cloud, absent)
     if cloud is None and distances is None:
         absent.setdefault("cloud", "This inspection has no cloud.")
-    return ReportEvidence(inspection, source, sha256, part, sparse, cloud, distances, absent)
+    return ReportEvidence(
+        inspection, source, sha256, part=part, sparse=sparse, cloud=cloud, distances=distances, absent=absent
+    )
 
 
 def _reconstruction(

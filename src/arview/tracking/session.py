@@ -233,7 +233,17 @@ class TrackingSession:
         ms = (time.perf_counter() - started) * 1e3
         if estimate is None:
             guide = self._guide if self.is_aligning else None
-            return Pose(None, None, 0.0, self.state, time_s, index, ms, reason, guide_cam_from_model=guide)
+            return Pose(
+                None,
+                None,
+                0.0,
+                state=self.state,
+                time_s=time_s,
+                index=index,
+                ms=ms,
+                reason=reason,
+                guide_cam_from_model=guide,
+            )
         pose = estimate.cam_from_model
         return Pose(
             cam_from_model=pose,

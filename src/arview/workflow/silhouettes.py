@@ -150,7 +150,9 @@ def silhouette_mask(
     reach_px = margin_mm * small.fx / nearest_mm + options.edge_px
     pad = int(np.ceil(min(reach_px, 0.5 * max(small.width, small.height))))
     low, (width, height) = low - pad, (high - low + 1 + 2 * pad).astype(int)
-    inverse_depth, _ = rasterise(vertices, model.mesh[1], small.fx, small.fy, -low[0], -low[1], int(width), int(height))
+    inverse_depth, _ = rasterise(
+        vertices, model.mesh[1], small.fx, fy=small.fy, cx=-low[0], cy=-low[1], width=int(width), height=int(height)
+    )
     if not (inverse_depth > 0).any():
         return np.zeros(columns.shape, dtype=np.bool_)
     distance = cv2.distanceTransform((inverse_depth <= 0).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)

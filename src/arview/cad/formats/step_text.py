@@ -189,7 +189,15 @@ def split_solids(data: bytes) -> bytes:
         for item in items:
             name = solids[item] if _plain_name(solids[item]) else product_name
             parts = _product_of_solid(
-                new_id, name, b"#" + item, origin, match[4], definition, shape, definition_context, product_context
+                new_id,
+                name,
+                b"#" + item,
+                origin=origin,
+                context=match[4],
+                parent=definition,
+                parent_shape=shape,
+                definition_context=definition_context,
+                product_context=product_context,
             )
             added += _statements(new_id, parts)
             new_id += len(parts)

@@ -274,7 +274,16 @@ def score_around(
             for i in range(3):
                 pose[i, 3] = cam_from_body[i, 3] * stretches[d]
             poses[index] = pose
-            count = collect_points(part, view, pose, intrinsics, step_mm, contour_count, edge_count, points)
+            count = collect_points(
+                part,
+                view,
+                pose,
+                intrinsics=intrinsics,
+                step_mm=step_mm,
+                contour_count=contour_count,
+                edge_count=edge_count,
+                points=points,
+            )
             if count < 16:
                 continue
             best, best_dx, best_dy = best_shift(maps, points, count, shift_px, shift_step, sums)

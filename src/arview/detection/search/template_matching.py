@@ -111,7 +111,9 @@ def _add_trimmed(
     for sector in range(SECTORS):
         one = own[sector]
         one[:size] = 0
-        _add_points(one, flat, source, shift, start, size, sector * each, (sector + 1) * each)
+        _add_points(
+            one, flat, source, shift=shift, start=start, size=size, first=sector * each, last=(sector + 1) * each
+        )
         for k in range(size):
             total[k] += one[k]
     lowest[:size] = 65535
@@ -166,9 +168,20 @@ def _sum_first_points(
         size = min(TILE, span - start)
         total[start : start + size] = 0
         if is_trimmed:
-            _add_trimmed(total[start : start + size], own, lowest, flat, source, shift, start, size)
+            _add_trimmed(
+                total[start : start + size], own, lowest, flat=flat, source=source, shift=shift, start=start, size=size
+            )
         else:
-            _add_points(total[start : start + size], flat, source, shift, start, size, 0, FIRST_POINTS)
+            _add_points(
+                total[start : start + size],
+                flat,
+                source,
+                shift=shift,
+                start=start,
+                size=size,
+                first=0,
+                last=FIRST_POINTS,
+            )
 
 
 @kernel(inline=True)
@@ -219,7 +232,9 @@ def _add_inside(inside: Any, flat: Any, source: Any, shift: Any, span: Any) -> A
     for start in range(0, span, TILE):
         size = min(TILE, span - start)
         inside[start : start + size] = 0
-        _add_points(inside[start : start + size], flat, source, shift, start, size, 0, FIRST_POINTS)
+        _add_points(
+            inside[start : start + size], flat, source, shift=shift, start=start, size=size, first=0, last=FIRST_POINTS
+        )
 
 
 @kernel(inline=True)

@@ -198,11 +198,11 @@ def cloud_component(name: str, model: Model, part: Part | None, views: SurfaceVi
         component,
         surface,
         others,
-        tried[is_spread & seen & (to_others > joint)],
-        tried[is_spread & touches],
-        usable,
-        spin_moves(component, surface, part),
-        joint,
+        samples=tried[is_spread & seen & (to_others > joint)],
+        contact=tried[is_spread & touches],
+        usable_faces=usable,
+        spins=spin_moves(component, surface, part),
+        joint_mm=joint,
     )
 
 

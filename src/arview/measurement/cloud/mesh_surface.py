@@ -108,21 +108,21 @@ class MeshSurface:
                 points[part],
                 hints[part],
                 reach * reach,
-                self._triangles,
-                self._sides,
-                self._is_edge,
-                self._corner_normals,
-                self._low,
-                self._high,
-                self._right,
-                self._start,
-                self._count,
-                self._order,
-                out.points[part],
-                out.faces[part],
-                out.distances[part],
-                out.normals[part],
-                out.is_edge[part],
+                triangles=self._triangles,
+                sides=self._sides,
+                edges=self._is_edge,
+                corner_normals=self._corner_normals,
+                low=self._low,
+                high=self._high,
+                right=self._right,
+                start=self._start,
+                count=self._count,
+                order=self._order,
+                out_points=out.points[part],
+                out_faces=out.faces[part],
+                out_distances=out.distances[part],
+                out_normals=out.normals[part],
+                out_edges=out.is_edge[part],
             )
 
         starts = range(0, count, _CHUNK)
@@ -285,7 +285,9 @@ def _tree(triangles: Array, used: NDArray[np.int64]) -> tuple[NDArray, ...]:  # 
     order, size = used.copy(), 2 * len(used)
     low, high = np.empty((size, 3)), np.empty((size, 3))
     right, start, count = (np.empty(size, dtype=np.int64) for _ in range(3))
-    nodes = _build(triangles.mean(axis=1), lows, highs, order, low, high, right, start, count)
+    nodes = _build(
+        triangles.mean(axis=1), lows, highs, order=order, low=low, high=high, right=right, start=start, count=count
+    )
     return order, low[:nodes].copy(), high[:nodes].copy(), right[:nodes], start[:nodes], count[:nodes]
 
 

@@ -112,11 +112,11 @@ def scene_points(points: Array, normals: Array | None, diameter_mm: float) -> Sc
         np.ascontiguousarray(points[coarse]),
         np.ascontiguousarray(estimated[coarse]),
         weights,
-        points[fine],
-        estimated[fine],
-        FINE * diameter_mm,
-        is_oriented,
-        before - len(points),
+        fine=points[fine],
+        fine_normals=estimated[fine],
+        fine_mm=FINE * diameter_mm,
+        is_oriented=is_oriented,
+        removed=before - len(points),
     )
 
 

@@ -168,7 +168,7 @@ def align(
             notes.append(f"scale from the distance of datum {one.label}")
     if free.shape[1]:
         raise InputError(f"the datums leave {direction_names(free)} free, and there is no base to fit; add a datum")
-    return _result(origin, move, gain, variances, equations, starts, found, tuple(notes), size_mm)
+    return _result(origin, move, gain, variances, equations, starts, found, notes=tuple(notes), size_mm=size_mm)
 
 
 def _result(
@@ -213,15 +213,17 @@ def _result(
                 one.of,
                 fit.sigma_mm,
                 fit.correlation,
-                fit.radius_mm,
-                rest_mm,
-                share,
+                radius_mm=fit.radius_mm,
+                rest_mm=rest_mm,
+                covariance=share,
             )
         )
         gains.append(part)
         covariance = covariance + share
     used_equations = tuple(equations[: len(found)])
-    return Alignment(origin, move, covariance, scale_covariance, tuple(results), tuple(gains), used_equations, notes)
+    return Alignment(
+        origin, move, covariance, scale_covariance, tuple(results), tuple(gains), used_equations, notes=notes
+    )
 
 
 def _solver(design: Array, one: DatumEquations, fit: DatumFit, scale_std: float | None) -> Array:

@@ -86,7 +86,17 @@ def surface_equations(
     """Equations of offsets (N,) along unit normals (N,3) at points (N,3) of the model; see `DatumEquations`."""
     rows = np.einsum("ni,nij->nj", normals, point_from_move(points))
     count = len(points) if of is None else of
-    return DatumEquations(label, feature, rows, offsets_mm, variances, points, count, by_radius, locks)
+    return DatumEquations(
+        label,
+        feature,
+        rows,
+        offsets_mm=offsets_mm,
+        variances=variances,
+        points=points,
+        of=count,
+        by_radius=by_radius,
+        locks=locks,
+    )
 
 
 def move_equations(label: str, move: Move, locks: tuple[str, ...] = DOF_NAMES) -> tuple[DatumEquations, Array]:

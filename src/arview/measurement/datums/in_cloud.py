@@ -85,7 +85,15 @@ def _measure(datum: Datum, model: Model, cloud: CloudPoints, moves: Mapping[str,
     radius = np.full(len(offsets), side) if is_round else None
     variances = near.sigma**2
     equations = surface_equations(
-        datum.label, datum.feature, near.points, normals, offsets, variances, None, radius, datum.locks
+        datum.label,
+        datum.feature,
+        near.points,
+        normals=normals,
+        offsets_mm=offsets,
+        variances=variances,
+        of=None,
+        by_radius=radius,
+        locks=datum.locks,
     )
     if radius is None:
         return equations
@@ -149,7 +157,15 @@ def _measure_edge(datum: Datum, model: Model, cloud: CloudPoints) -> DatumEquati
         parts.append((at @ (solver @ offsets[band]), spread, np.tile(normal, (2, 1))))
     offsets, variances, normals = (np.concatenate(column) for column in zip(*parts, strict=True))
     return surface_equations(
-        datum.label, "edge", np.tile(ends, (2, 1)), normals, offsets, variances, None, None, datum.locks
+        datum.label,
+        "edge",
+        np.tile(ends, (2, 1)),
+        normals=normals,
+        offsets_mm=offsets,
+        variances=variances,
+        of=None,
+        by_radius=None,
+        locks=datum.locks,
     )
 
 

@@ -156,12 +156,12 @@ def _measure_rim(datum: Datum, views: PhotoViews) -> DatumEquations:
         datum.label,
         datum.feature,
         points[which[steps.ok]],
-        steps.directions,
-        steps.offsets,
-        steps.variances,
-        len(which),
-        steps.design[:, 3],
-        datum.locks,
+        normals=steps.directions,
+        offsets_mm=steps.offsets,
+        variances=steps.variances,
+        of=len(which),
+        by_radius=steps.design[:, 3],
+        locks=datum.locks,
     )
     angles = (np.arange(len(points)) * 2 * np.pi / len(points))[which[steps.ok]]
     shift_mm = rim_shift_mm(steps.design, steps.offsets, steps.variances, angles, RIM_PX * px_mm)
@@ -287,12 +287,12 @@ def _measure_cylinder(datum: Datum, views: PhotoViews) -> DatumEquations:
         datum.label,
         "cylinder",
         samples.points[ok],
-        radial[ok],
-        found.offsets_mm[ok],
-        variances[ok],
-        seen,
-        np.full(np.count_nonzero(ok), side),
-        datum.locks,
+        normals=radial[ok],
+        offsets_mm=found.offsets_mm[ok],
+        variances=variances[ok],
+        of=seen,
+        by_radius=np.full(np.count_nonzero(ok), side),
+        locks=datum.locks,
     )
 
 
@@ -327,11 +327,11 @@ def _measure_edge(datum: Datum, views: PhotoViews) -> DatumEquations:
         datum.label,
         "edge",
         points[which[steps.ok]],
-        steps.directions,
-        steps.offsets,
-        steps.variances,
-        len(which),
-        None,
-        datum.locks,
+        normals=steps.directions,
+        offsets_mm=steps.offsets,
+        variances=steps.variances,
+        of=len(which),
+        by_radius=None,
+        locks=datum.locks,
     )
     return replace(equations, form_mm=DATUM_EDGE_PX * px_mm)

@@ -76,12 +76,12 @@ def measure_plane_by_edges(datum: Datum, views: PhotoViews, whole: Move | None =
         equations.label,
         "fit",
         equations.rows,
-        equations.offsets_mm,
-        equations.variances,
-        equations.points,
-        equations.of,
-        None,
-        datum.locks,
+        offsets_mm=equations.offsets_mm,
+        variances=equations.variances,
+        points=equations.points,
+        of=equations.of,
+        by_radius=None,
+        locks=datum.locks,
         directions=directions,
     )
 
@@ -149,7 +149,16 @@ def _by_own_edges(datum: Datum, edges: EdgePoints, views: PhotoViews) -> Move:
     covariance = fit.covariance + project @ (systematic + np.outer(dark, dark)) @ project.T
     used = int(np.count_nonzero(fit.weights > 0.1))
     move = Move(
-        datum.component, "edges", center, twist, covariance, fit.undetermined, radius_mm, used, fit.residual_mm, 1.0
+        datum.component,
+        "edges",
+        center,
+        twist=twist,
+        covariance=covariance,
+        undetermined=fit.undetermined,
+        radius_mm=radius_mm,
+        used=used,
+        residual_mm=fit.residual_mm,
+        support=1.0,
     )
     if _is_open(move, plane_directions(np.array(datum.direction_in_model))):
         raise DatumNotMeasuredError(f"{name}: the edges in it do not determine its tilt; photograph it from more sides")
@@ -189,11 +198,11 @@ def _fitted(
         move_rows(moved.points[ok], found.directions[ok], middle),
         found.offsets_mm[ok],
         sigmas,
-        np.zeros((0, 6)),
-        radius_mm,
-        REACH_MM,
-        moved.points[ok] / (4.0 * px_mm),
-        MIN_SIGMA_PX / 0.3,
+        free=np.zeros((0, 6)),
+        radius_mm=radius_mm,
+        undetermined_mm=REACH_MM,
+        places=moved.points[ok] / (4.0 * px_mm),
+        min_sigma=MIN_SIGMA_PX / 0.3,
         max_pairs=3000,
     )
     return fit, fit.gain @ (np.sign(found.slopes[ok]) * found.mm_per_px[ok]) * (0.5 * MAX_DARK_SHIFT_PX)

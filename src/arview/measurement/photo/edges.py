@@ -147,7 +147,17 @@ def edge_offsets(
         hypotheses / mm_per_px[:, None], strengths, 0.4 * reach_px, HALF_SLOPE
     )  # in px, so that the choice does not depend on the distance
     merged_mm = merged_shift_px(gap, BLUR_PX) * mm_per_px
-    return EdgeOffsets(directions, chosen * mm_per_px, mm_per_px, slope, seen, hypotheses, strengths, twists, merged_mm)
+    return EdgeOffsets(
+        directions,
+        chosen * mm_per_px,
+        mm_per_px,
+        slopes=slope,
+        seen=seen,
+        hypotheses_mm=hypotheses,
+        strengths=strengths,
+        pose_rows=twists,
+        merged_mm=merged_mm,
+    )
 
 
 def _across(camera: Camera, in_cam: Array, pixels: Array, tangents: Array) -> tuple[Array, Array]:
@@ -350,13 +360,13 @@ class ComponentEdges:
             rows,
             found.offsets_mm[ok] - dark * dark_mm,
             sigmas,
-            self.body.free_at(place),
-            self.body.radius_mm,
-            UNDETERMINED_MM,
-            edges.points[ok] / (4.0 * self.body.px_mm),
-            MIN_SIGMA_PX / _SIGMA_PX,
-            move_rows(edges.points[found.seen], found.directions[found.seen], center),
-            MIN_DIRECTION,
+            free=self.body.free_at(place),
+            radius_mm=self.body.radius_mm,
+            undetermined_mm=UNDETERMINED_MM,
+            places=edges.points[ok] / (4.0 * self.body.px_mm),
+            min_sigma=MIN_SIGMA_PX / _SIGMA_PX,
+            searched_rows=move_rows(edges.points[found.seen], found.directions[found.seen], center),
+            min_support=MIN_DIRECTION,
             max_pairs=len(ok) if is_last else _FEW_PAIRS,
         )
         left = found.offsets_mm[ok] - rows @ fit.twist

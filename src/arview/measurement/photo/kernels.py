@@ -57,7 +57,17 @@ def sweep_scores(
     shade = np.empty((3, p_all))
     u, v = np.empty(p_all), np.empty(p_all)
     for i in range(n):
-        used = _to_cameras(patches[i], is_on[i], shades[i], normals[i], views[i], poses, in_cam, direction, shade)
+        used = _to_cameras(
+            patches[i],
+            is_on[i],
+            shades[i],
+            normal=normals[i],
+            views=views[i],
+            poses=poses,
+            in_cam=in_cam,
+            direction=direction,
+            shade=shade,
+        )
         if used < _MIN_POINTS:
             continue
         for s in range(s_all):

@@ -92,11 +92,11 @@ def fit_rim(
             _rows(found, outward)[ok],
             found.offsets_mm[ok],
             0.3 * found.mm_per_px[ok],
-            np.array(locked),
-            1.0,
-            reach_mm,
-            edges.points[ok] / (4.0 * px_mm),
-            MIN_SIGMA_PX / 0.3,
+            free=np.array(locked),
+            radius_mm=1.0,
+            undetermined_mm=reach_mm,
+            places=edges.points[ok] / (4.0 * px_mm),
+            min_sigma=MIN_SIGMA_PX / 0.3,
         )
         shift = shift + fit.twist[3:]
         radius_mm += float(fit.twist[0])

@@ -59,8 +59,8 @@ def rival_offsets_px(edges: EdgePoints, views: PhotoViews, reach_px: float, same
             continue
         index = np.flatnonzero(good)
         first, second = index[pairs[:, 0]], index[pairs[:, 1]]
-        _note(result, of, first, second, pixels, along, reach_px, same_px)
-        _note(result, of, second, first, pixels, along, reach_px, same_px)
+        _note(result, of, first, second=second, pixels=pixels, along=along, reach_px=reach_px, same_px=same_px)
+        _note(result, of, second, second=first, pixels=pixels, along=along, reach_px=reach_px, same_px=same_px)
     return result
 
 

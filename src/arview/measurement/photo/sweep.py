@@ -124,7 +124,14 @@ def sweep_offsets(
     chosen = pick_views(views, samples, component, removed=removed)
     steps = _steps(reach_mm, 0.4 * px_mm)
     scores, count, chosen = agreeing_scores(
-        patches, is_on, shades_of(is_on), samples.normals, steps, chosen, views, 1.5
+        patches,
+        is_on,
+        shades_of(is_on),
+        normals=samples.normals,
+        steps=steps,
+        chosen=chosen,
+        views=views,
+        min_contrast=1.5,
     )
     return _peaks(scores, count, steps, is_on.sum(axis=1), chosen)
 
@@ -219,11 +226,20 @@ def agreeing_scores(
         scores (N,S), numbers of views (N,S), and the views (N,V) that remain.
     """
     stack = views.levels[0]
-    scores, count, similarity = sweep_scores(patches, is_on, shades, normals, steps, chosen, stack, min_contrast)
+    scores, count, similarity = sweep_scores(
+        patches, is_on, shades, normals=normals, steps=steps, views=chosen, stack=stack, min_contrast=min_contrast
+    )
     kept = without_outliers(chosen, scores, similarity)
     changed = np.flatnonzero((kept != chosen).any(axis=1))
     scores[changed], count[changed], _ = sweep_scores(
-        patches[changed], is_on[changed], shades[changed], normals[changed], steps, kept[changed], stack, min_contrast
+        patches[changed],
+        is_on[changed],
+        shades[changed],
+        normals=normals[changed],
+        steps=steps,
+        views=kept[changed],
+        stack=stack,
+        min_contrast=min_contrast,
     )
     return scores, count, kept
 
@@ -325,7 +341,14 @@ class ComponentSweep:
             moved = Samples(apply(place, self.samples.points), self.samples.normals @ place[:3, :3].T)
             shaped = apply(place, patches)
             scores, count, chosen = agreeing_scores(
-                shaped, is_on, shades, moved.normals, steps, chosen, self.views, MIN_CONTRAST
+                shaped,
+                is_on,
+                shades,
+                normals=moved.normals,
+                steps=steps,
+                chosen=chosen,
+                views=self.views,
+                min_contrast=MIN_CONTRAST,
             )
             found = _peaks(scores, count, steps, is_on.sum(axis=1), chosen)
             ok = found.is_ok
@@ -357,7 +380,14 @@ class ComponentSweep:
         steps = 0.7 * self.body.px_mm * np.arange(-1.0, 2.0)
         normals = self.samples.normals @ place[:3, :3].T
         scores, _, _ = sweep_scores(
-            apply(place, patches), is_on, shades, normals, steps, self._pick(place), self.views.levels[0], 1.5
+            apply(place, patches),
+            is_on,
+            shades,
+            normals=normals,
+            steps=steps,
+            views=self._pick(place),
+            stack=self.views.levels[0],
+            min_contrast=1.5,
         )
         return float(np.maximum(scores.max(axis=1) - 0.3, 0.0).sum())
 
@@ -388,7 +418,14 @@ class ComponentSweep:
         steps = _steps(CAPTURE_MM + coarse_mm, 0.6 * coarse_mm)
         normals = self.samples.normals
         scores, _, _ = sweep_scores(
-            patches, is_on, shades_of(is_on), normals, steps, chosen, self.views.levels[level], 1.0
+            patches,
+            is_on,
+            shades_of(is_on),
+            normals=normals,
+            steps=steps,
+            views=chosen,
+            stack=self.views.levels[level],
+            min_contrast=1.0,
         )
         shifts = self.body.shifts(CAPTURE_MM)
         votes = vote_shifts(scores[seen], steps, normals[seen], shifts, 0.3)
@@ -407,11 +444,11 @@ class ComponentSweep:
                 rows[ok],
                 found.offsets_mm[ok],
                 sigmas,
-                self.body.free,
-                self.body.radius_mm,
-                UNDETERMINED_MM,
-                self._places(self.samples.of(ok)),
-                0.3,
+                free=self.body.free,
+                radius_mm=self.body.radius_mm,
+                undetermined_mm=UNDETERMINED_MM,
+                places=self._places(self.samples.of(ok)),
+                min_sigma=0.3,
             ).twist
         return self.body.moved(np.eye(4), twist)
 
@@ -423,13 +460,13 @@ class ComponentSweep:
             rows[ok],
             found.offsets_mm[ok],
             np.sqrt(found.variances_mm2[ok] + MIN_SIGMA_MM**2),
-            self.body.free_at(place),
-            self.body.radius_mm,
-            UNDETERMINED_MM,
-            self._places(moved.of(ok)),
-            0.3,
-            rows[seen],
-            MIN_DIRECTION,
+            free=self.body.free_at(place),
+            radius_mm=self.body.radius_mm,
+            undetermined_mm=UNDETERMINED_MM,
+            places=self._places(moved.of(ok)),
+            min_sigma=0.3,
+            searched_rows=rows[seen],
+            min_support=MIN_DIRECTION,
         )
 
     def _places(self, samples: Samples) -> Array:

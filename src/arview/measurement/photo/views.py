@@ -140,12 +140,12 @@ class PhotoViews:
             groups,
             stack.poses[view],
             stack.lenses[view],
-            stack.sizes[view],
-            np.array(window.lens),
-            np.array(window.origin),
-            window.inverse_depth,
-            window.ids,
-            component,
+            size=stack.sizes[view],
+            ideal=np.array(window.lens),
+            origin=np.array(window.origin),
+            inverse_depth=window.inverse_depth,
+            ids=window.ids,
+            component=component,
         )
 
 

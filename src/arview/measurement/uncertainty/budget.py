@@ -180,12 +180,12 @@ def place(
         twist,
         covariance,
         contributions,
-        combined.undetermined,
-        observable_axes(combined.undetermined, np.eye(3)),
-        axes,
-        own_observable,
-        lengths[0],
-        lengths[1],
+        undetermined=combined.undetermined,
+        observable=observable_axes(combined.undetermined, np.eye(3)),
+        axes=axes,
+        own_observable=own_observable,
+        distance=lengths[0],
+        angle=lengths[1],
     )
 
 

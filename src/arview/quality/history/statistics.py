@@ -120,7 +120,14 @@ def control_chart(values: ArrayLike, is_length: bool = False) -> ControlChart:
     _add_runs(signals, steps, TREND_RUN - 1, f"{TREND_RUN} in a row that rise or fall")
     lower = max(0.0, center - reach) if is_length else center - reach
     return ControlChart(
-        x, center, lower, center + reach, ranges, mean_range, _D4 * mean_range, dict(sorted(signals.items()))
+        x,
+        center,
+        lower,
+        upper=center + reach,
+        ranges=ranges,
+        range_center=mean_range,
+        range_upper=_D4 * mean_range,
+        signals=dict(sorted(signals.items())),
     )
 
 
@@ -184,15 +191,15 @@ def capability(
         count,
         mean,
         std,
-        lower,
-        upper,
-        cp,
-        cp_interval,
-        cpk,
-        (cpk - spread, cpk + spread),
-        chart.is_in_control,
-        share,
-        tuple(warnings),
+        lower=lower,
+        upper=upper,
+        cp=cp,
+        cp_interval=cp_interval,
+        cpk=cpk,
+        cpk_interval=(cpk - spread, cpk + spread),
+        is_in_control=chart.is_in_control,
+        measurement_share=share,
+        warnings=tuple(warnings),
     )
 
 

@@ -491,7 +491,7 @@ def _voided(connection: sa.Connection) -> dict[int, Void]:
 
 def _listed(row: Any, voided: dict[int, Void]) -> StoredResult:
     return StoredResult(
-        int(row.id), row.content_hash, row.part, row.serial, row.station, row.model_hash,
-        datetime.fromisoformat(row.measured), datetime.fromisoformat(row.added), row.verdict, row.tool,
-        voided.get(int(row.id)),
+        int(row.id), row.content_hash, row.part, serial=row.serial, station=row.station, model_hash=row.model_hash,
+        measured=datetime.fromisoformat(row.measured), added=datetime.fromisoformat(row.added), verdict=row.verdict,
+        tool=row.tool, void=voided.get(int(row.id)),
     )  # fmt: skip

@@ -145,7 +145,16 @@ def _subject(part: Part, deviation: ComponentDeviation, told: Instruction | None
             place[:3, 3] = -correction.shift_mm
         measured = replace(nominal, vertices_in_model=apply(place, nominal.vertices_in_model))
     view = view_of(part, standing, correction)
-    return _Subject(part, deviation, standing, correction, told, view, nominal, measured)
+    return _Subject(
+        part,
+        deviation,
+        standing,
+        correction=correction,
+        instruction=told,
+        view=view,
+        nominal=nominal,
+        measured=measured,
+    )
 
 
 def view_of(part: Part, standing: Standing, correction: Correction) -> ParallelView:

@@ -114,7 +114,17 @@ def _heights(components: Sequence[Component], view: ParallelView, window: Window
         # From so far away the perspective moves nothing by more than a thousandth of a pixel.
         far = 1e4 * max(float(np.abs(flat).max()), width * pitch)
         points = np.stack([flat[:, 0] - window[0] + pitch, flat[:, 1] - window[1] + pitch, far - flat[:, 2]], axis=1)
-        inverse, _ = rasterise(points, component.faces, far / pitch, far / pitch, 0.0, 0.0, width, height, 1.0)
+        inverse, _ = rasterise(
+            points,
+            component.faces,
+            far / pitch,
+            fy=far / pitch,
+            cx=0.0,
+            cy=0.0,
+            width=width,
+            height=height,
+            near_mm=1.0,
+        )
         with np.errstate(divide="ignore"):
             found = np.maximum(found, far - 1.0 / inverse)
     return found

@@ -185,21 +185,32 @@ def _search(
     steps = [(0.5 ** (turn + stage) * unit_w, 0.5 * 0.5 ** (turn + stage)) for turn in range(SWEEPS[stage])]
     randoms = RANDOMS if stage == 0 else 0
     if device is not None:
-        return search_torch(problem, np.stack(given), spread, randoms, low, high, steps, stage > 0, seed, device)
+        return search_torch(
+            problem,
+            np.stack(given),
+            spread,
+            randoms=randoms,
+            low=low,
+            high=high,
+            steps=steps,
+            is_dense=stage > 0,
+            seed=seed,
+            device=device,
+        )
     planes, costs = np.zeros((height, width, 3), np.float32), np.empty((height, width), np.float32)
     scratch, indices = make_scratch(is_dense=stage > 0)
     try_hypotheses(
         problem,
         scratch,
         indices,
-        planes,
-        costs,
-        np.stack(given),
-        np.float32(spread),
-        randoms,
-        np.float32(low),
-        np.float32(high),
-        seed,
+        planes=planes,
+        costs=costs,
+        hypotheses=np.stack(given),
+        spread=np.float32(spread),
+        randoms=randoms,
+        lowest=np.float32(low),
+        highest=np.float32(high),
+        seed=seed,
     )
     for turn, (step_w, step_tilt) in enumerate(steps):
         for color in (0, 1):
@@ -207,13 +218,13 @@ def _search(
                 problem,
                 scratch,
                 indices,
-                planes,
-                costs,
-                NEIGHBOURS,
-                color,
-                np.float32(step_w),
-                np.float32(step_tilt),
-                seed + 101 * (turn + 1),
+                planes=planes,
+                costs=costs,
+                regions=NEIGHBOURS,
+                color=color,
+                step_w=np.float32(step_w),
+                step_tilt=np.float32(step_tilt),
+                seed=seed + 101 * (turn + 1),
             )
     return planes
 
@@ -226,6 +237,16 @@ def _polished(views: list[DenseView], greys: list[Floats], maps: list[Planes], i
     unit_w = 1.0 / float(np.mean(problem.warps[:, PARALLAX]))
     scores, sigmas = np.empty((height, width), np.float32), np.empty((height, width), np.float32)
     scratch, indices = make_scratch(0.5 * (STEPS[-1] - 1))
-    polish(problem, scratch, indices, planes, scores, sigmas, STEPS[-1], POLISH_ITERATIONS, unit_w)
+    polish(
+        problem,
+        scratch,
+        indices,
+        planes=planes,
+        scores=scores,
+        sigmas=sigmas,
+        step_px=STEPS[-1],
+        iterations=POLISH_ITERATIONS,
+        unit_w=unit_w,
+    )
     camera = views[index].camera.scaled(width, height)
     return DepthMap(camera, views[index].cam_from_scan, planes, scores, sigmas, unit_w * STEPS[-1])

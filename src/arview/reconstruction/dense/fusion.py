@@ -105,7 +105,16 @@ def fuse(
     merged = np.zeros((len(stack.elements), 3), dtype=np.float32)
 
     def merge(i: int) -> None:
-        _merge(i, neighbours[i], stack.elements, stack.layout, stack.cameras, stack.poses, limits, merged)
+        _merge(
+            i,
+            neighbours[i],
+            stack.elements,
+            layout=stack.layout,
+            cameras=stack.cameras,
+            poses=stack.poses,
+            limits=limits,
+            merged=merged,
+        )
 
     def points_of(i: int) -> _Points:
         first, width, height = stack.layout[i]

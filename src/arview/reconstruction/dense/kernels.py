@@ -277,7 +277,9 @@ def element_cost(
         h = warp(warps, k, x, y, w, du, dv)
         cost = _WORST
         if falls_inside(sizes, k, h):
-            cost = min(_ONE - zncc(pixels, sizes, s, index, k, h, variance, numbers[NOISE]), _WORST)
+            cost = min(
+                _ONE - zncc(pixels, sizes, s, index=index, k=k, h=h, variance=variance, noise=numbers[NOISE]), _WORST
+            )
             if maps.shape[0] > 0:
                 cost += numbers[GEOMETRIC] * disagreement_px(maps, sizes, warps, numbers[MAP_STEP], k, h, w)
         j = k

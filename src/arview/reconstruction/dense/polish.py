@@ -184,7 +184,18 @@ def polish(
                 for k in range(count):
                     h = warp(warps, k, at_x, at_y, w, du, dv)
                     if falls_inside(sizes, k, h):
-                        _normal_equations(pixels, sizes, warps, s, index, k, h, variance, floor, system)
+                        _normal_equations(
+                            pixels,
+                            sizes,
+                            warps,
+                            s=s,
+                            index=index,
+                            k=k,
+                            h=h,
+                            variance=variance,
+                            noise=floor,
+                            system=system,
+                        )
                 if system[10] < needed:
                     lasting = False
                     break

@@ -155,7 +155,15 @@ def make_view(
         grey = np.repeat(np.where(allowed, 255, 0).astype(np.uint8)[..., None], 3, axis=2)
         is_seen &= _undistorted(grey, photo.camera, camera)[0][..., 0] > 127
     return DenseView(
-        index, photo.name, camera, photo.cam_from_scan, color, inside & is_seen, nearest, farthest, sources
+        index,
+        photo.name,
+        camera,
+        cam_from_scan=photo.cam_from_scan,
+        color=color,
+        region=inside & is_seen,
+        nearest=nearest,
+        farthest=farthest,
+        sources=sources,
     )
 
 
@@ -225,11 +233,11 @@ def render_cad(cad: Cad, cam_from_scan: Array, camera: Camera) -> tuple[Array, N
         apply(cam_from_scan @ cad.scan_from_model, vertices),
         faces,
         camera.fx,
-        camera.fy,
-        camera.cx,
-        camera.cy,
-        camera.width,
-        camera.height,
+        fy=camera.fy,
+        cx=camera.cx,
+        cy=camera.cy,
+        width=camera.width,
+        height=camera.height,
     )
 
 

@@ -198,7 +198,9 @@ def find_cad(
         )
         votes, turns, reason = _search(photos, order, read, views, progress)
         if votes:
-            return _refined(photos, order, read, part, votes, turns, options, progress)
+            return _refined(
+                photos, order, read, part=part, votes=votes, turns=turns, options=options, progress=progress
+            )
         reasons.append(reason)
         if reason.is_contradiction:
             break

@@ -85,7 +85,16 @@ def check_consistency(
         reason = f"{100 * support.share:.0f} % of the CAD's edges found in {len(is_misfit)} photos"
         if near is not None:
             reason += f", {100 * near:.0f} % of {len(offsets)} points within {tolerance_mm:.1f} mm of its surface"
-    return Consistency(not against, reason, support.share, support.chance, found.fit.sigma_px, near, behind, misfits)
+    return Consistency(
+        not against,
+        reason,
+        support.share,
+        edges_by_chance=support.chance,
+        residual_px=found.fit.sigma_px,
+        points_near=near,
+        points_behind=behind,
+        misfits=misfits,
+    )
 
 
 def points_before_surface(sparse: SparseModel, model: Model, similarity: Similarity) -> Array:

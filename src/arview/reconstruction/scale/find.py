@@ -87,11 +87,11 @@ def find_scale(
             combined.scale if combined else None,
             combined.std if combined else None,
             None,
-            None,
-            combined.evidence if combined else (),
-            tuple(warnings),
-            no_fit.reason,
-            consistency,
+            covariance=None,
+            evidence=combined.evidence if combined else (),
+            warnings=tuple(warnings),
+            why_no_frame=no_fit.reason,
+            consistency=consistency,
         )
     # The change of scale by the other sources moves the frame by as much as the two are correlated.
     fit = found.fit
@@ -113,11 +113,11 @@ def find_scale(
         combined.scale,
         combined.std,
         similarity.model_from_scan,
-        _positive(covariance),
-        combined.evidence,
-        tuple(warnings),
-        "",
-        consistency,
+        covariance=_positive(covariance),
+        evidence=combined.evidence,
+        warnings=tuple(warnings),
+        why_no_frame="",
+        consistency=consistency,
     )
 
 

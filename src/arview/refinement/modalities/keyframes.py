@@ -200,7 +200,9 @@ def _place_corners(
             dx = r[0, 0] * rx + r[0, 1] * ry + r[0, 2]
             dy = r[1, 0] * rx + r[1, 1] * ry + r[1, 2]
             dz = r[2, 0] * rx + r[2, 1] * ry + r[2, 2]
-            depth, face = cast_ray(hierarchy, r[0, 3], r[1, 3], r[2, 3], dx, dy, dz, 1e30, False)
+            depth, face = cast_ray(
+                hierarchy, r[0, 3], r[1, 3], oz=r[2, 3], dx=dx, dy=dy, dz=dz, limit=1e30, any_hit=False
+            )
             if face < 0:
                 whole = False
                 break

@@ -226,7 +226,16 @@ def refine_by_shading(
         for k in range(2):
             center_px[k] = middle_px[k] + focal_px[k] * pose[k, 3] / pose[2, 3]
         draw_surface(surface, pose, focal_px, center_px, diameter_mm, drawn, face_ids)
-        _smooth_normals(drawn, face_ids, surface, corners, pose, focal_px, middle_px, diameter_mm)
+        _smooth_normals(
+            drawn,
+            face_ids,
+            surface,
+            corners=corners,
+            pose=pose,
+            focal_px=focal_px,
+            middle_px=middle_px,
+            diameter_mm=diameter_mm,
+        )
         places = _inner_pixels(drawn, face_ids)
         if len(places) < MIN_PIXELS:
             return ShadedPose(cam_from_body.copy(), information.copy(), -1.0)
@@ -237,7 +246,16 @@ def refine_by_shading(
             values[i] = bright[v, u]
             _harmonics(drawn[0, v, u], drawn[1, v, u], drawn[2, v, u], functions[i])
         light, weights = _fit_light(values, functions, light, explained >= 0.0)
-        motion = _jacobian(places, light, drawn, face_ids, pose, focal_px, middle_px, diameter_mm)
+        motion = _jacobian(
+            places,
+            light,
+            drawn,
+            face_ids=face_ids,
+            pose=pose,
+            focal_px=focal_px,
+            middle_px=middle_px,
+            diameter_mm=diameter_mm,
+        )
         hessian, gradient, explained = _reduce_system(motion, functions, values, weights, light)
         best = information + gain * hessian
         if not _is_determined(best):

@@ -159,7 +159,17 @@ def align_pose(
     for _ in range(8):
         hessian[:] = 0.0
         gradient[:] = 0.0
-        add_matches(hessian, gradient, points, cam_from_body, intrinsics, pixels, weights, sigma_px, robust_px)
+        add_matches(
+            hessian,
+            gradient,
+            points,
+            cam_from_body,
+            intrinsics,
+            pixels,
+            weights,
+            sigma_px=sigma_px,
+            robust_px=robust_px,
+        )
         cam_from_body = apply_twist(cam_from_body, solve_step(hessian, gradient, damping))
         robust_px = max(3.0, 0.6 * robust_px)
     return cam_from_body
@@ -211,7 +221,7 @@ def _find_visible(
         if settings.check_occlusion:
             # The ray starts 1 % along its way, so that it does not hit the surface itself.
             x, y, z = p[0] + 0.01 * dx, p[1] + 0.01 * dy, p[2] + 0.01 * dz
-            _, face = cast_ray(hierarchy, x, y, z, dx, dy, dz, 0.99, True)
+            _, face = cast_ray(hierarchy, x, y, z, dx, dy, dz, limit=0.99, any_hit=True)
         wanted[i] = face < 0
     return wanted
 
@@ -285,7 +295,9 @@ def _align_level(
         if norm == 0.0:
             continue
         u, v = pixels[i, 0] / scale, pixels[i, 1] / scale
-        u, v, ncc = align_template(image, u, v, side, template, across, down, normal, norm, 12, 0.03)
+        u, v, ncc = align_template(
+            image, u, v, side, template, across, down, normal=normal, norm=norm, steps=12, stop_px=0.03
+        )
         if ncc >= min_ncc:
             pixels[i, 0], pixels[i, 1] = u * scale, v * scale
             scores[i] = ncc
@@ -324,28 +336,28 @@ def match_texture(
     warps = np.empty((count, 2, 2))
     scores = np.zeros(count)
     expected = _find_visible(anchors, hierarchy, cam_from_body, settings)
-    _predict(anchors, cam_from_body, intrinsics, width, height, expected, predicted, warps)
+    _predict(anchors, cam_from_body, intrinsics, width, height, expected, predicted, warps=warps)
     seen = np.flatnonzero(expected)
     pixels = predicted.copy()
     if settings.search_px > 0 and len(seen) > 0:
         chosen = seen[:: max(1, len(seen) // 24)]
         shift = common_shift(
-            key_pyramid[top], pyramid[top], 1 << top, anchors.pixels, predicted, warps, chosen, settings.search_px
+            key_pyramid[top], pyramid[top], 1 << top, anchors.pixels, predicted, warps, chosen, reach=settings.search_px
         )
         for a in range(2):
             pixels[:, a] += shift[a]
     if top > 1:
-        _align_level(2, key_pyramid, pyramid, anchors.pixels, warps, expected, COARSE_NCC, pixels, scores)
+        _align_level(2, key_pyramid, pyramid, anchors.pixels, warps, expected, COARSE_NCC, pixels=pixels, scores=scores)
         found = np.count_nonzero(scores)
         coarse = align_pose(points, cam_from_body, intrinsics, pixels, scores, damping, 1.0)
         near = _count_near(points, coarse, intrinsics, pixels, scores, 5.0)
         if near >= 8 and near > 0.6 * found:
-            _predict(anchors, coarse, intrinsics, width, height, expected, predicted, warps)
+            _predict(anchors, coarse, intrinsics, width, height, expected, predicted, warps=warps)
             pixels[:] = predicted
-    _align_level(1, key_pyramid, pyramid, anchors.pixels, warps, expected, min_ncc, pixels, scores)
+    _align_level(1, key_pyramid, pyramid, anchors.pixels, warps, expected, min_ncc, pixels=pixels, scores=scores)
     # A patch found only at half resolution, because of blur or noise, is half as accurate.
     weights = np.maximum(scores - min_ncc, 0.0) / (4.0 * (1.0 - min_ncc))
-    _align_level(0, key_pyramid, pyramid, anchors.pixels, warps, expected, min_ncc, pixels, scores)
+    _align_level(0, key_pyramid, pyramid, anchors.pixels, warps, expected, min_ncc, pixels=pixels, scores=scores)
     for i in range(count):
         if scores[i] > 0.0:
             weights[i] = (scores[i] - min_ncc) / (1.0 - min_ncc)

@@ -97,8 +97,9 @@ something could not be stored; then it is not confirmed.
     201 *Job* that measures these components again; 409 ``not_done`` before the first measurement.
 ``POST /api/jobs/JOB/decisions`` ``{"component", "is_ok", "reason", "note", "by", "photo": name | null}``, ``…/ticks``
 ``{"component", "step": index, "is_done", "by"}``, ``…/sign`` ``{"by", "note"}``
-    201, the entry of the log, see `arview.quality.decisions`, which a job and its re-checks share; 409 ``not_done`` while there
-    is no result. A signature holds for the values and verdicts: it is void if the cloud changes one of them.
+    201, the entry of the log, see `arview.quality.decisions`, which a job and its re-checks share; 409 ``not_done``
+    while there is no result. A signature holds for the values and verdicts: it is void if the cloud changes one of
+    them.
 ``GET /api/jobs/JOB/report.html``, ``inspection.json``, ``decisions.csv``, ``photos/NAME``, ``rework/COMPONENT.svg``,
 ``rework/PICTURE``
     Files of the job; a picture by the name that an instruction has for it.
@@ -111,8 +112,8 @@ connection has **one** video transceiver, ``sendrecv`` for a phone (its camera o
 camera track should have ``contentHint = "detail"`` and ``degradationPreference = "maintain-resolution"``: frames that
 arrive smaller are scaled back (notice ``frames_scaled``).
 
-Every video frame, in both directions, carries a stamp below its picture: see `arview.station.live.stream.stamp`. Widths and
-heights are even.
+Every video frame, in both directions, carries a stamp below its picture: see `arview.station.live.stream.stamp`. Widths
+and heights are even.
 
 - page to server: each camera frame, stamped with an id assigned by the page;
 - server to page, mode video: the annotated picture, stamped with the id of the frame that it was drawn on;
@@ -140,9 +141,9 @@ Join::
 
 **Texts.** All texts are English. *Pose*, *Status*, *Part*, *Job* and ``capture`` have ``"messages": {text: {"key",
 "values": {name: text, number, {"key", "values"} or a list of those}}}`` for those of their texts that are in the
-catalogue (`arview.station.live.stream.phrases`, `arview.station.capture.words`), so that a page can say them in its own language; of a
-text of several sentences with ``; `` between them, each is looked up by itself where the whole is not there. Errors and
-notices without one have their code.
+catalogue (`arview.station.live.stream.phrases`, `arview.station.capture.words`), so that a page can say them in its own
+language; of a text of several sentences with ``; `` between them, each is looked up by itself where the whole is not
+there. Errors and notices without one have their code.
 
 Pose::
 

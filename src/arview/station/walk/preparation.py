@@ -81,7 +81,14 @@ class PhotoPreparation:
             min_move_px = MAX_SHIFT_PX if remarks else 0.0
             known = KnownPairs(poses=poses_of(photos))
             match_by_appearance(
-                intake.photos, features, sparse, self.threads, _nothing, min_move_px, known, self.memory
+                intake.photos,
+                features,
+                sparse,
+                threads=self.threads,
+                tell=_nothing,
+                min_move_px=min_move_px,
+                known=known,
+                memory=self.memory,
             )
             self.also(intake.photos)
         except ArviewError:

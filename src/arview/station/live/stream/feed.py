@@ -295,7 +295,16 @@ class Feed:
         self._serial += 1
         if self._session is None:
             reason = self._refused.text if self._refused else ""
-            pose = Pose(None, None, 0.0, TrackingState.SEARCHING, arrived_s, frame.frame_id, 0.0, reason)
+            pose = Pose(
+                None,
+                None,
+                0.0,
+                state=TrackingState.SEARCHING,
+                time_s=arrived_s,
+                index=frame.frame_id,
+                ms=0.0,
+                reason=reason,
+            )
             poses = tuple(replace(pose, instance=one.name) for one in self._subjects)
         else:
             poses = self._session.process(np.ascontiguousarray(frame.image), frame.frame_id, arrived_s)
