@@ -82,15 +82,15 @@ def placed_with_silhouettes(
     Raises:
         CannotMeasureError: the photos cannot be placed, neither whole nor by the part.
     """
-    whole, failure = None, None
+    whole: SparseModel | CannotMeasureError
     try:
         whole = place(photos, folder)
     except CannotMeasureError as error:
         if not can_place_again:
             raise
-        failure = error
+        whole = error
     reason = "the whole photos could not be placed"
-    if whole is not None:
+    if isinstance(whole, SparseModel):
         found = silhouettes.at_poses(whole, masks_folder, tell)
         count = len(whole.photos)
         is_enough = count >= MIN_PLACED * len(photos)
@@ -101,9 +101,8 @@ def placed_with_silhouettes(
                 "whole photos",
             )
         reason = f"only {count} of {len(photos)} photos were placed whole" if found.masks else found.detail
-    if not can_place_again:
-        assert whole is not None
-        return _with_remark(whole, _not_made(reason))
+        if not can_place_again:
+            return _with_remark(whole, _not_made(reason))
     return _placed_by_part(
         photos,
         folder,
@@ -112,7 +111,6 @@ def placed_with_silhouettes(
         place=place,
         tell=tell,
         whole=whole,
-        failure=failure,
         reason=reason,
     )
 
@@ -124,8 +122,7 @@ def _placed_by_part(
     silhouettes: Silhouettes,
     place: Callable[[Sequence[Photo], Path], SparseModel],
     tell: Progress,
-    whole: SparseModel | None,
-    failure: CannotMeasureError | None,
+    whole: SparseModel | CannotMeasureError,
     reason: str,
 ) -> SparseModel:
     """The photos placed by the pixels of the part alone; as they were placed before where that places no more."""
@@ -134,7 +131,7 @@ def _placed_by_part(
     problem = f"the part was found in {len(masked)} photos by itself" if masked else found.detail
     if len(masked) >= MIN_FOUND:
         try:
-            sparse = _placed_apart(masked, folder, place, 0 if whole is None else len(whole.photos))
+            sparse = _placed_apart(masked, folder, place, len(whole.photos) if isinstance(whole, SparseModel) else 0)
         except CannotMeasureError as error:
             problem = f"the part was found in {len(masked)} photos, which could not be placed by it alone: {error}"
         else:
@@ -148,8 +145,8 @@ def _placed_by_part(
             wide = silhouettes.at_poses(sparse, masks_folder, tell)
             remark += f"; the cloud comes from {wide.detail}" if wide.masks else ""
             return _with_remark(with_masks_of(_unmasked(sparse), wide.masks), remark)
-    if whole is None:
-        raise CannotMeasureError(f"{failure}; --masks auto does not help: {problem}") from failure
+    if isinstance(whole, CannotMeasureError):
+        raise CannotMeasureError(f"{whole}; --masks auto does not help: {problem}") from whole
     return _with_remark(whole, _not_made(f"{reason}; {problem}"))
 
 

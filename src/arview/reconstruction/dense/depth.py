@@ -80,7 +80,7 @@ def depth_maps(
     with ThreadPoolExecutor(threads) as pool:
         for stage, step in enumerate(STEPS):
             small = [_shrunk(grey, step) for grey in greys]
-            search = partial(_search, views, small, maps, sparse, cad, options, stage, device)
+            search = partial(_search, views, small, maps, sparse, cad, (options, device), stage)
             maps = _each(pool, search, len(views), f"depth maps {stage + 1} of {len(STEPS)}", progress)
         return _each(pool, partial(_polished, views, greys, maps), len(views), "polishing", progress)
 
@@ -164,12 +164,12 @@ def _search(
     maps: list[Planes],
     sparse: SparseModel,
     cad: Cad | None,
-    options: DenseOptions,
+    how: tuple[DenseOptions, str | None],
     stage: int,
-    device: str | None,
     index: int,
 ) -> Planes:
-    """PatchMatch of one view at one level; ``maps`` are those of the previous level, or empty."""
+    """PatchMatch of one view at one level by options and a torch device; ``maps``: of the previous level, or empty."""
+    options, device = how
     view, step = views[index], STEPS[stage]
     height, width = greys[index].shape
     camera = view.camera.scaled(width, height)
