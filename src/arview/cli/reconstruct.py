@@ -80,7 +80,7 @@ reconstruction.json. An interrupted run resumes where it stopped; --force starts
 @click.option("--seed", type=int, default=0, show_default=True, help="The same seed gives the same cloud.")
 @click.option("--threads", type=click.IntRange(min=0), default=0, metavar="N", help="Threads; default: all cores.")
 @click.option("--device", default="auto", show_default=True, metavar="auto|cpu|cuda[:N]",
-              help="Device for features, matching and the dense cloud; auto takes a CUDA GPU if torch (arview[gpu]) "
+              help="Device for features, matching and the dense cloud; auto takes a CUDA GPU if torch (extra gpu) "
               "finds one.")  # fmt: skip
 @click.option("--force", is_flag=True, help="Repeat all stages, even those already finished in OUT.")
 @UNIT
