@@ -256,10 +256,6 @@ def live(
         clients=clients,
     )
     _tell_logs()
-    try:
-        require("an inspection started on the page", "pycolmap", "jinja2", "markupsafe", "matplotlib")
-    except MissingDependencyError as error:
-        say(f"warning: {error}")
     server = LiveServer(options, open_endpoint(host, port, is_plain, cert, key))
     from arview.guideviews import GuideViewOptions
     from arview.live.server.loading import load_subjects
@@ -359,6 +355,10 @@ async def _serve(server: LiveServer, load: Callable[[], Subjects]) -> None:
 
 
 def _print_welcome(server: LiveServer) -> None:
+    try:
+        require("an inspection started on the page", "pycolmap", "jinja2", "markupsafe", "matplotlib")
+    except MissingDependencyError as error:
+        say(f"warning: {error}")
     endpoint = server.endpoint
     certificates = endpoint.certificates
     click.echo(f"page:  {server.link}")
