@@ -31,7 +31,7 @@ DATA = {
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    pytest.importorskip("hatchling", reason="hatchling, of arview[dev], builds the wheel")
+    pytest.importorskip("hatchling", reason="hatchling, of the extra dev, builds the wheel")
     folder = tmp_path_factory.mktemp("wheel")
     command = ["-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation", "-w", folder, ROOT]
     subprocess.run([sys.executable, *map(str, command)], check=True)

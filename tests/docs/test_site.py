@@ -71,7 +71,7 @@ def test_examples_run(page: Path, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
-    pytest.importorskip("mkdocs", reason="the extra arview[docs] is not installed")
+    pytest.importorskip("mkdocs", reason="the extra docs is not installed")
     built = subprocess.run(
         [sys.executable, "-m", "mkdocs", "build", "--strict", "-f", ROOT / "tools/docs/mkdocs.yml", "-d", tmp_path],
         env={**os.environ, "NO_MKDOCS_2_WARNING": "1"}, capture_output=True, text=True,

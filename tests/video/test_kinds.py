@@ -394,7 +394,7 @@ def test_dng_pictures(tmp_path: Path) -> None:
 def test_dng_without_its_reader_is_one_clear_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_dng(tmp_path / "a.dng", 819)
     monkeypatch.setitem(sys.modules, "rawpy", None)
-    with pytest.raises(MissingDependencyError, match="DNG pictures need rawpy; run: pip install rawpy"):
+    with pytest.raises(MissingDependencyError, match=r"DNG pictures needs rawpy.*pip install .*\[formats\]"):
         open_source(tmp_path)
 
 

@@ -87,7 +87,7 @@ def load_cad(
         InputError: missing, empty, broken, truncated or unsupported file; a tolerance that is not positive or too
             fine; NaN vertices; no triangles; more than 5 million; no unit known; a size below 1 mm or above 100 m
             with no ``unit`` given, below 0.1 mm or above 1 km with one.
-        MissingDependencyError: STEP without cascadio.
+        MissingDependencyError: glTF with Draco compression without DracoPy.
     """
     path = Path(path)
     suffix = path.suffix.lower()

@@ -10,7 +10,8 @@ from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from arview.errors import InputError, MissingDependencyError
+from arview.core.extras import load
+from arview.errors import InputError
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -170,11 +171,7 @@ def _sensor_widths_mm() -> dict[str, float]:
 
 @cache
 def _add_heif_to_pillow() -> None:
-    try:
-        from pillow_heif import register_heif_opener
-    except ImportError as error:
-        raise MissingDependencyError("HEIC photos need pillow-heif; run: pip install pillow-heif") from error
-    register_heif_opener()
+    load("reading HEIC photos", "pillow_heif").register_heif_opener()
 
 
 def _orientation(value: Any) -> int:

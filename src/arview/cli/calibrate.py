@@ -11,6 +11,7 @@ import click
 from arview.cli.common import Group, main, output_path, progress_bar, say
 from arview.cli.exit_codes import ExitCode
 from arview.core.atomic import write_file
+from arview.core.extras import require
 from arview.errors import InputError, OutputError
 
 if TYPE_CHECKING:
@@ -172,6 +173,8 @@ def lens(
         kind, name = _format_and_path(text)
         targets.append((kind, output_path(name, [*sources, *(other for _, other in targets)])))
     picture = None if plot is None else output_path(plot, [*sources, *(path for _, path in targets)])
+    if picture is not None:
+        require("--plot", "matplotlib")
     if profile:
         profile_path(profile)
     one = parse_board(board_spec)

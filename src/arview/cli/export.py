@@ -9,6 +9,7 @@ import click
 
 from arview.cli.common import UNIT, main, output_path, say
 from arview.core.atomic import write_file
+from arview.core.extras import require
 from arview.errors import InputError, OutputError
 
 FORMATS = ("csv", "qif", "dfq", "glb", "html", "pdf", "decisions")
@@ -73,11 +74,15 @@ def export(
     """Write INSPECTION in other formats."""
     from arview.cad import load_part
     from arview.inspection import load_inspection
-    from arview.inspection.export import to_csv, to_dfq, to_glb, to_qif
+    from arview.inspection.export import to_csv, to_dfq, to_glb
     from arview.inspection.fingerprint import fingerprint_of_file
     from arview.quality.decisions import decisions_csv, log_of
     from arview.quality.decisions.table import decided_cells
 
+    if "qif" in formats:
+        from arview.inspection.export import to_qif
+    if {"html", "pdf"} & set(formats):
+        require("a report", "jinja2", "markupsafe", "matplotlib", *(("weasyprint",) if "pdf" in formats else ()))
     source = Path(inspection)
     targets = _targets(source, formats, output, part_path)
     part = None if part_path is None else load_part(part_path, unit)

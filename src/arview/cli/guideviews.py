@@ -131,9 +131,9 @@ def studio(part: str, port: int, others: tuple[str, ...], unit: str | None, no_b
     import sys
     import webbrowser
 
-    from arview.cli.live import require_extra
+    from arview.core.extras import require_extra
 
-    require_extra()
+    require_extra("arview studio", "station")
     from arview.cad import load_part
     from arview.station.studio.document import StudioDocument
     from arview.station.studio.server import StudioServer

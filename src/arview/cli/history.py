@@ -13,6 +13,7 @@ import click
 from arview.cli.common import main, output_path, progress_bar, say
 from arview.cli.exit_codes import ExitCode
 from arview.core.atomic import write_file
+from arview.core.extras import require
 from arview.errors import ArviewError, InputError
 
 if TYPE_CHECKING:
@@ -71,7 +72,7 @@ The store only grows: results are added, never changed or deleted; the database 
 that must not count is voided with a reason, and stays visible.
 Each result is identified by the SHA-256 of its content, so that adding it again changes nothing. Two
 stations may add at the same time. SQLite serves one machine; use PostgreSQL for several
-(pip install 'arview[postgres]').""",
+(the extra `postgres`).""",
 )
 def history() -> None:
     """Store inspections, and see trends and capability over time."""
@@ -252,6 +253,9 @@ def chart(
 ) -> None:  # fmt: skip
     """Show the trend of a component over the parts, with control limits, Cp and Cpk."""
     from arview.quality.history import Capability, capability_by_limits, control_chart, series_of
+
+    if output is not None:
+        require("a figure", "matplotlib")
     from arview.quality.history.chart import FORMATS, draw
 
     target = None if output is None else output_path(output, [])
@@ -443,7 +447,7 @@ def _decided_word(state: RecordState | None) -> str:
 
 
 def _open(store: str | None, must_exist: bool = False) -> HistoryStore:
-    from arview.quality.history.store import HistoryStore, default_store
+    from arview.quality.history import HistoryStore, default_store
 
     return HistoryStore(store or default_store(), must_exist)
 

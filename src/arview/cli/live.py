@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-import importlib.util
 import logging
 import os
 import signal
@@ -18,6 +17,7 @@ import click
 
 from arview.cli.common import RENDERER, UNIT, check_profile, main, output_path, progress_bar, refuse_for_several, say
 from arview.cli.exit_codes import ExitCode
+from arview.core.extras import require, require_extra
 from arview.errors import InputError, MissingDependencyError
 
 if TYPE_CHECKING:
@@ -27,7 +27,6 @@ if TYPE_CHECKING:
 
 STOP_DEADLINE_S = 4.6
 """Time from a signal to the end of the program, whatever its workers do."""
-EXTRA = ("aiortc", "starlette", "uvicorn", "cryptography", "segno")
 _AGES_S = {"min": 60.0, "h": 3600.0, "d": 86400.0}
 
 
@@ -278,7 +277,7 @@ def live(
     """Serve the overlay of PART, or of several, to phones and screens in the local network."""
     import asyncio
 
-    require_extra()
+    require_extra("arview live", "station")
     from arview.station.live.options import JobOptions, LiveOptions, RecordingOptions
     from arview.station.live.security.devices import devices_path
     from arview.station.live.server.live_server import LiveServer, open_endpoint
@@ -396,19 +395,6 @@ def _leave_threads() -> None:
         os._exit(ExitCode.INTERRUPTED)
 
 
-def require_extra() -> None:
-    """Check that the libraries of the live server are installed.
-
-    Raises:
-        MissingDependencyError: with the line that installs them.
-    """
-    missing = [name for name in EXTRA if importlib.util.find_spec(name) is None]
-    if missing:
-        raise MissingDependencyError(
-            f"arview live needs {', '.join(missing)}: run  pip install 'arview[live]'  and try again"
-        )
-
-
 async def _serve(server: LiveServer, load: Callable[[], Subjects]) -> None:
     from arview.station.live.server.loading import warm_up
 
@@ -425,6 +411,10 @@ async def _serve(server: LiveServer, load: Callable[[], Subjects]) -> None:
 
 
 def _print_welcome(server: LiveServer) -> None:
+    try:
+        require("an inspection started on the page", "pycolmap", "jinja2", "markupsafe", "matplotlib")
+    except MissingDependencyError as error:
+        say(f"warning: {error}")
     endpoint = server.endpoint
     certificates = endpoint.certificates
     click.echo(f"page:  {server.link}")

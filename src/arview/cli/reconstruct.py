@@ -103,7 +103,7 @@ reconstruction.json. An interrupted run resumes where it stopped; --force starts
     default="auto",
     show_default=True,
     metavar="auto|cpu|cuda[:N]",
-    help="Device for features, matching and the dense cloud; auto takes a CUDA GPU if torch (arview[gpu]) finds one.",
+    help="Device for features, matching and the dense cloud; auto takes a CUDA GPU if torch (extra gpu) finds one.",
 )
 @click.option("--force", is_flag=True, help="Repeat all stages, even those already finished in OUT.")
 @UNIT

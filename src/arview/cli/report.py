@@ -11,7 +11,7 @@ import click
 from arview.cli.common import UNIT, main, output_path, say, stage_bar
 from arview.cli.exit_codes import ExitCode
 from arview.core.atomic import write_file
-from arview.errors import InputError, OutputError
+from arview.errors import InputError, MissingDependencyError, OutputError
 
 
 @main.command(
@@ -264,13 +264,27 @@ def decisions(job: str, output: str | None) -> None:
 def _told_state(job: str) -> bool:
     """Print what was decided so far, and bring the report up to date; whether the part is released."""
     from arview.quality.decisions import state_of_record
-    from arview.report.decisions import update_reports
 
     state = state_of_record(job)
     for line in (*state.faults, *state.notices):
         say(line)
     if state.sentence:
         click.echo(state.sentence)
-    for page in update_reports(job):
+    for page in _not_updated(job):
         say(f"{page}: has no place for these decisions; write it again with `arview report`")
     return state.is_released
+
+
+def _not_updated(job: str) -> tuple[Path, ...]:
+    """Bring the reports of a record up to date, if there are any; those that could not be are returned."""
+    from arview.quality.decisions.folder import first_inspection
+
+    if not first_inspection(job).with_name("report.html").is_file():
+        return ()
+    try:
+        from arview.report import update_reports
+
+        return update_reports(job)
+    except MissingDependencyError as error:
+        say(f"the report was not brought up to date: {error}")
+        return ()

@@ -12,6 +12,7 @@ import click
 from arview.cli.common import UNIT, main, output_path, say
 from arview.cli.exit_codes import ExitCode, exit_code_of
 from arview.core.atomic import write_file
+from arview.core.extras import require
 from arview.errors import InputError
 
 if TYPE_CHECKING:
@@ -86,6 +87,8 @@ def verify(
     limit = None if mpe is None else parse_limit(mpe)
     target = None if output is None else output_path(output, [measured, known])
     picture = None if plot is None else output_path(plot, [measured, known, target])
+    if picture is not None:
+        require("--plot", "matplotlib")
     if _is_list(measured, known):
         if limit is not None or picture is not None:
             raise InputError(f"{known}: lists components, not lengths; --mpe and --plot do not apply")

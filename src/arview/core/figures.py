@@ -7,6 +7,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
+from arview.core.extras import load
+
 INK, MUTED, GRID = "#1c2430", "#5b6675", "#dfe4ea"
 _STYLE: dict[str, Any] = {
     "svg.hashsalt": "arview",
@@ -43,7 +45,7 @@ def figure(
         options: passed to ``Figure.subplots``.
     """
     logging.getLogger("matplotlib.font_manager").setLevel(logging.ERROR)  # Inter belongs to the page
-    import matplotlib as mpl
+    mpl = load("a figure", "matplotlib")
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

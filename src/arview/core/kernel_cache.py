@@ -128,6 +128,13 @@ def kernel_digest(function: Callable[..., Any]) -> str:
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()
 
 
+def count_callees(function: Callable[..., Any]) -> int:
+    """Number of functions that a kernel calls, and that these call."""
+    seen: set[str] = set()
+    _describe(function, [], seen)
+    return len(seen) - 1
+
+
 def _describe(function: Any, parts: list[str], seen: set[str]) -> None:
     name = f"{function.__module__}:{function.__qualname__}"
     parts += [name, function.__dict__.get(_OPTIONS, "")]

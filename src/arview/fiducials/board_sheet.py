@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from arview.core.extras import load
 from arview.errors import InputError
 from arview.fiducials.board import Board, cv_board, spec_of
 from arview.geometry import Array
@@ -160,7 +161,7 @@ def rectangles_mm(board: Board) -> tuple[Array, Array]:
 
 def board_pdf(sheet: Sheet) -> bytes:
     """One page of PDF with the board, two rulers, and the command line for ``arview calibrate``."""
-    import pydyf
+    pydyf = load("the PDF of a board", "pydyf")
 
     stream = pydyf.Stream(compress=False)
     stream.set_matrix(_PT_PER_MM, 0, 0, _PT_PER_MM, 0, 0)

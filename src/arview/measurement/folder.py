@@ -12,6 +12,7 @@ import numpy as np
 from arview.cad.model import Model
 from arview.cad.part import Part
 from arview.camera import Camera
+from arview.core.extras import require
 from arview.errors import InputError
 from arview.measurement.cloud.global_registration import find_model_in_cloud
 from arview.measurement.cloud.placing import cloud_in_mm, moved_to_model, orient_normals, place_cloud, scaled
@@ -110,7 +111,9 @@ def read_cloud(
 
     Raises:
         InputError: the file cannot be read, holds no points, or has the size of the CAD in no unit.
+        MissingDependencyError: Open3D is not installed.
     """
+    require("finding the part in a cloud", "open3d")
     path = Path(path)
     given = None if unit is None else unit_of_option(unit)
     own = _own_ply(path)

@@ -17,7 +17,7 @@ import numpy as np
 
 from arview.camera import Camera
 from arview.camera.undistort import require_brown
-from arview.errors import MissingDependencyError
+from arview.core.extras import load
 from arview.geometry import Array, rigid
 from arview.reconstruction.types import Photo, PosedPhoto, SparseModel
 
@@ -36,10 +36,7 @@ def import_pycolmap() -> Any:
         MissingDependencyError: pycolmap is not installed.
     """
     zlib.crc32(b"")
-    try:
-        import pycolmap
-    except ImportError as error:
-        raise MissingDependencyError(f"pycolmap cannot be loaded ({error}); pip install pycolmap") from error
+    pycolmap = load("a reconstruction from photos", "pycolmap")
     pycolmap.logging.minloglevel = 3
     _take_back_signals()
     return pycolmap

@@ -29,6 +29,7 @@ import numpy as np
 from arview.cad import Part
 from arview.core.atomic import replacing
 from arview.core.checks import PATH, check_type
+from arview.core.extras import require
 from arview.core.progress import Progress
 from arview.core.stage_cache import Stages, content_key, key_of, write_json
 from arview.errors import InputError, OutputError
@@ -150,10 +151,12 @@ def reconstruct(
         InputError: too few or unusable photos, or photos that do not fit together; the message says what to do.
         MismatchError: the camera does not fit the photos.
         OutputError: the folder cannot be written to.
+        MissingDependencyError: pycolmap is not installed.
     """
     check_type(source, (*PATH, list, tuple), "reconstruct: source")
     check_type(folder, PATH, "reconstruct: folder")
     check_type(part, (Part, NoneType), "reconstruct: part")
+    require("a reconstruction from photos", "pycolmap")
     run = _ReconstructionRun(
         Path(folder), part, options or ReconstructOptions(), progress or (lambda what, done, total: None), memory
     )

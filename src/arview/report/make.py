@@ -9,6 +9,7 @@ from typing import Any
 from arview.cad.part import Part
 from arview.core.atomic import write_file
 from arview.core.checks import PATH, check_type
+from arview.core.extras import require
 from arview.core.progress import Progress
 from arview.errors import InputError, MissingDependencyError
 from arview.report.evidence import ReportEvidence, gather
@@ -85,12 +86,9 @@ def _weasyprint() -> Any:
 
     for name in ("weasyprint", "fontTools"):
         logging.getLogger(name).setLevel(logging.ERROR)
+    require("the PDF", "weasyprint")
     try:
         import weasyprint
-    except ImportError as error:
-        raise MissingDependencyError(
-            "the PDF needs WeasyPrint: pip install weasyprint (the HTML report does not)"
-        ) from error
     except OSError as error:
         raise MissingDependencyError(
             f"the PDF needs the Pango libraries: {PANGO_INSTALL_COMMAND} (the HTML report does not)"

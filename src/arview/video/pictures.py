@@ -7,7 +7,6 @@ import re
 import struct
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from importlib import import_module
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arview.camera.exif import HEIF_SUFFIXES, PHOTO_SUFFIXES, check_jpeg_scans, open_picture, read_exif
+from arview.core.extras import load
 from arview.errors import InputError, MissingDependencyError
 from arview.video.frame import Frame, Image
 from arview.video.source import FrameRange, FrameSource, read_ahead
@@ -338,10 +338,7 @@ def _read_heif(data: bytes) -> Image | None:
 
 def _read_raw(data: bytes) -> Image | None:
     """(H,W,3) uint8 RGB of a DNG, upright, with the white balance of the camera and one brightness for all pictures."""
-    try:
-        rawpy = import_module("rawpy")
-    except ImportError as error:
-        raise MissingDependencyError("DNG pictures need rawpy; run: pip install rawpy") from error
+    rawpy = load("reading DNG pictures", "rawpy")
     try:
         with rawpy.imread(io.BytesIO(data)) as raw:
             return np.ascontiguousarray(raw.postprocess(use_camera_wb=True, no_auto_bright=True, output_bps=8))

@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from arview.core.checks import PATH, check_type
+from arview.core.extras import require
 from arview.core.progress import Progress
 from arview.core.stage_cache import Stages, content_key, key_of
 from arview.errors import CannotMeasureError, InputError, MismatchError, MissingDependencyError
@@ -138,6 +139,7 @@ def inspect_prepared(
     Raises:
         the same as `inspect_part`.
     """
+    require("an inspection", "pycolmap", "jinja2", "markupsafe", "matplotlib")
     with exclusive_access(folder, ".lock", waits=False):
         run = _InspectionRun(prepared, folder, progress or (lambda what, done, total: None), memory)
         return run.execute(starts_over, on_verdict)

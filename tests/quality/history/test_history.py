@@ -356,7 +356,7 @@ def test_wrong_stores(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_without_the_driver(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "psycopg", None)
-    with pytest.raises(MissingDependencyError, match=r"pip install 'arview\[postgres\]'"):
+    with pytest.raises(MissingDependencyError, match=r"pip install .*\[postgres\]'"):
         HistoryStore("postgresql://qa@127.0.0.1:1/none")
 
 

@@ -17,7 +17,8 @@ from seeds import make_seeds
 from arview.cli import main
 
 LEFT_OUT = {"live", "studio", "study", "warmup", "batch"}
-"""Commands that run for long or start other processes: their options are tested by name in tests/station/live and tests/cli."""
+"""Commands that run for long or start other processes: their options are tested by name, in tests/station/live and
+tests/cli."""
 TEXTS = (
     "",
     "-1",

@@ -2,7 +2,7 @@
 
     python tools/benchmarks/gpu [--only renderers,features,matching,dense] [--json out/gpu.json]
 
-Renderers are timed in any case. Features, matching and the dense search need torch and kornia (arview[gpu]): they run
+Renderers are timed in any case. Features, matching and the dense search need torch and kornia (the extra gpu): they run
 on torch for the processor, and on CUDA where there is one. A result outside its bounds ends with exit code 1.
 Times on the processor are of its own clock, which other programs on the machine disturb little; those on CUDA are wall
 times of both, after a first run.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -14,7 +13,8 @@ from numpy.typing import NDArray
 
 from arview.cad.formats.limited_process import TIMED_OUT, ProcessLimits, run_limited
 from arview.cad.formats.raw import MAX_TRIANGLES
-from arview.errors import InputError, MissingDependencyError
+from arview.core.extras import require
+from arview.errors import InputError
 
 EXTENSION = "KHR_draco_mesh_compression"
 LIMITS = ProcessLimits(cpu_s=10.0, cpu_s_per_mb=5.0, max_cpu_s=120.0, memory_mb=1500.0, memory_mb_per_mb=60.0)
@@ -71,8 +71,7 @@ def decode_draco(
         InputError: broken data, too many triangles, or too much time or memory.
         MissingDependencyError: without DracoPy.
     """
-    if importlib.util.find_spec("DracoPy") is None:
-        raise MissingDependencyError(f"{path}: reading Draco compression needs DracoPy: pip install DracoPy")
+    require(f"{path}: Draco compression", "DracoPy")
     size_mb = sum(len(data) for data, _ in meshes) / 1e6
     with tempfile.TemporaryDirectory(prefix="arview-draco-") as name:
         folder = Path(name)

@@ -13,7 +13,7 @@ from arview.cad.formats.gltf import parse_gltf
 from arview.cad.formats.limited_process import TIMED_OUT, ProcessLimits, run_limited
 from arview.cad.formats.raw import RawComponent, RawModel
 from arview.cad.formats.step_text import prepare_step, products_without_shape, step_unit_mm
-from arview.errors import InputError, MissingDependencyError
+from arview.errors import InputError
 
 StepLimits = ProcessLimits
 DEFAULT = StepLimits()
@@ -48,12 +48,7 @@ def read_step(
 
     Raises:
         InputError: a broken or truncated file, or one that takes too much time or memory.
-        MissingDependencyError: without cascadio.
     """
-    import importlib.util
-
-    if importlib.util.find_spec("cascadio") is None:
-        raise MissingDependencyError("reading STEP needs cascadio: pip install cascadio")
     data = path.read_bytes()
     prepared = prepare_step(data, path)
     raw = parse_gltf(_triangulated(prepared, path, tol_linear_mm, tol_angular_deg, limits), path)

@@ -4,13 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from arview.errors import InputError
+from arview.core.extras import load
 
 
 def load_open3d() -> Any:
-    """The module ``open3d``. Raises InputError when it, or a library that it needs, is missing."""
-    try:
-        import open3d
-    except (ImportError, OSError) as error:
-        raise InputError(f"Open3D cannot be loaded ({error}); run tools/setup as root") from error
-    return open3d
+    """The module ``open3d``. Raises MissingDependencyError when it, or a library that it needs, is missing."""
+    return load("a cloud of another program", "open3d")

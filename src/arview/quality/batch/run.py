@@ -17,6 +17,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from arview.core.extras import require
 from arview.core.stage_cache import write_json
 from arview.errors import ArviewError, CannotMeasureError, InputError, MismatchError, MissingDependencyError
 from arview.inspection.fingerprint import content_hash, fingerprint_of_file
@@ -216,10 +217,9 @@ def run_batch(
         MissingDependencyError: Dask is not installed.
     """
     options = options or BatchOptions()
-    try:
-        from distributed import as_completed
-    except ImportError as error:
-        raise MissingDependencyError("a batch needs Dask: pip install 'arview[batch]'") from error
+    require("a batch", "distributed")
+    from distributed import as_completed
+
     results: dict[str, JobResult] = {}
     with _client(options, len(jobs)) as client:
         workers = client.nthreads()

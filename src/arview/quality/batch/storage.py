@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from arview.core.extras import load
 from arview.errors import InputError, MissingDependencyError, OutputError
 
 _URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+://")
@@ -78,10 +79,7 @@ def upload(folder: Path, names: Iterable[str], location: str) -> None:
 
 def _opened(location: str) -> tuple[Any, str]:
     """The file system and the path in it of a path or URL."""
-    try:
-        import fsspec
-    except ImportError as error:
-        raise MissingDependencyError("storage by URL needs fsspec: pip install 'arview[batch]'") from error
+    fsspec = load("storage by URL", "fsspec")
     try:
         system, path = fsspec.url_to_fs(location)
     except ImportError as error:  # fsspec says which package a kind of storage needs

@@ -28,6 +28,7 @@ from sqlalchemy.exc import (
     SQLAlchemyError,
 )
 
+from arview.core.extras import install_command
 from arview.errors import InputError, MissingDependencyError, OutputError
 from arview.inspection import Inspection, load_inspection
 from arview.inspection.fingerprint import content_hash
@@ -137,7 +138,7 @@ class HistoryStore:
             self._engine = sa.create_engine(url, **({"connect_args": {"timeout": BUSY_S}} if self.is_sqlite else {}))
         except (ImportError, NoSuchModuleError) as error:
             raise MissingDependencyError(
-                f"{self.name}: the driver is not installed: pip install 'arview[postgres]' ({error})"
+                f"{self.name}: the driver cannot be loaded ({error}); run: {install_command('postgres')}"
             ) from error
         if self.is_sqlite:
             sa.event.listen(self._engine, "connect", prepare_sqlite)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -110,13 +111,13 @@ def read_ply(path: str | Path) -> DenseCloud:
         raise InputError(f"{path}: is truncated; reconstruct again")
     rows = np.frombuffer(body, dtype=_VERTEX)
 
-    def columns(names: str) -> NDArray[np.generic]:
+    def columns(names: str) -> NDArray[Any]:
         return np.stack([rows[name] for name in names.split()], axis=-1)
 
     return DenseCloud(
         columns("x y z"),
         columns("nx ny nz"),
-        columns("red green blue"),  # type: ignore[arg-type]
+        columns("red green blue"),
         rows["sigma_mm"].astype(np.float32),
         rows["views"].astype(np.uint8),
     )

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import importlib.util
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from arview.core.extras import is_installed, require
 from arview.errors import InputError
 
 _PACKAGES = ("torch", "kornia")
@@ -18,15 +18,12 @@ def torch_device(device: str) -> str | None:
         device: ``auto`` (CUDA if torch finds it), ``cpu``, or a torch device such as ``cuda`` or ``cuda:1``.
 
     Raises:
-        InputError: torch or kornia is not installed, or torch cannot use the device.
+        InputError: torch cannot use the device.
+        MissingDependencyError: torch or kornia is not installed.
     """
-    missing = [name for name in _PACKAGES if importlib.util.find_spec(name) is None]
-    if device == "cpu" or (device == "auto" and missing):
+    if device == "cpu" or (device == "auto" and not all(map(is_installed, _PACKAGES))):
         return None
-    if missing:
-        raise InputError(
-            f"device {device}: {' and '.join(missing)} not installed; pip install 'arview[gpu]', or use --device cpu"
-        )
+    require(f"--device {device}", *_PACKAGES)
     import torch
 
     if device == "auto":

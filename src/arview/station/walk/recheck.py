@@ -164,10 +164,10 @@ class RecheckWorker(WalkWorker):
 
     def _report(self, part: Part) -> None:
         """Write the report, and what the first measurement's report says of re-checks."""
-        from arview.report.decisions import update_reports
-
         super()._report(part)
         with contextlib.suppress(ArviewError):
+            from arview.report import update_reports
+
             update_reports(self.first.path)
 
 

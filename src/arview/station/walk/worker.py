@@ -201,9 +201,9 @@ class WalkWorker:
 
     def _report(self, part: Part) -> None:
         """Write the report of what is measured."""
-        from arview.report import make_report
-
         try:
+            from arview.report import make_report
+
             make_report(self.job.path / "inspection.json", self.job.path / "report.html", None, part)
         except ArviewError as error:
             self._say(text=f"{self.state.text}; no report: {error}")
@@ -226,9 +226,9 @@ class WalkWorker:
         store = os.environ.get("ARVIEW_STORE")
         if not store:
             return
-        from arview.quality.history import HistoryStore
-
         try:
+            from arview.quality.history import HistoryStore
+
             with HistoryStore(store) as opened:
                 opened.add(self.job.path / "inspection.json")
         except ArviewError as error:

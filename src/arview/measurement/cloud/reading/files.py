@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from arview.errors import InputError
+from arview.core.extras import load, require
+from arview.errors import ArviewError, InputError
 from arview.measurement.cloud.open3d_library import load_open3d
 from arview.measurement.cloud.reading.raw_points import PointCollector, RawPoints, check_count
 from arview.measurement.cloud.reading.text import BLOCK_BYTES, read_text
@@ -182,14 +183,12 @@ def _read_e57(path: Path) -> RawPoints:
 @contextmanager
 def _library(*names: str, path: Path, kind: str) -> Iterator[tuple[Any, ...]]:
     """Libraries by name; whatever they raise becomes an InputError about the file."""
-    from importlib import import_module
-
+    purpose = f"{path}: reading {kind}"
+    require(purpose, *names)
     try:
-        yield tuple(import_module(name) for name in names)
-    except InputError:
+        yield tuple(load(purpose, name) for name in names)
+    except ArviewError:
         raise
-    except ImportError as error:
-        raise InputError(f"{path}: reading {kind} needs {' and '.join(names)} ({error}); run tools/setup") from error
     except Exception as error:  # a damaged file may make the reader raise anything
         reason = str(error).split("\n")[0][:200]
         raise InputError(f"{path}: is not a {kind} file with points, or damaged ({reason})") from error

@@ -7,8 +7,6 @@ import os
 import threading
 
 from arview.errors import ArviewError
-from arview.quality.history import HistoryStore
-from arview.report.decisions import update_reports
 from arview.station.walk.job import JobFolder
 
 logger = logging.getLogger("arview.station.live")
@@ -25,8 +23,12 @@ def tell_report_and_history(job: JobFolder) -> None:
     inspection = (job.parent or job).path / "inspection.json"
     with _WRITING:
         try:
+            from arview.report import update_reports
+
             update_reports(job.path)
             if store := os.environ.get("ARVIEW_STORE"):
+                from arview.quality.history import HistoryStore
+
                 with HistoryStore(store) as opened:
                     opened.add(inspection)
         except ArviewError as error:
