@@ -18,7 +18,7 @@ from arview.live.stream.subject import Subject
 from arview.workflow.walk.job import JobFolder, jobs_in
 
 MAX_JOBS = 5000
-"""Of which the folder may hold so many."""
+"""Jobs that the folder may hold."""
 
 logger = logging.getLogger("arview.live")
 

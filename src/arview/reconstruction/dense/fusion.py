@@ -78,7 +78,7 @@ def fuse(
     maps: Sequence[DepthMap], images: Sequence[Image], threads: int,
     progress: Progress,
 ) -> DenseCloud:  # fmt: skip
-    """Fuse depth maps into the cloud of all points that ``options.min_views`` maps agree on.
+    """Fuse depth maps into the cloud of all points that ``MIN_VIEWS`` maps agree on.
 
     Args:
         maps: depth maps of the views.

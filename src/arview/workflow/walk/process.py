@@ -19,7 +19,7 @@ from arview.workflow.walk.recheck import RecheckWorker
 from arview.workflow.walk.worker import WalkWorker
 
 NICENESS = 5
-"""Of the process while the user waits …."""
+"""Niceness of the process while the user waits …."""
 
 
 def main(arguments: Sequence[str]) -> int:
