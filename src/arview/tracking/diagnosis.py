@@ -33,7 +33,7 @@ MIN_EDGES = 6
 MIN_STEP_SHARE = 0.12
 """Edges lower than this share of the brightest grey level are not used to measure the blur."""
 MIN_STEP = 10.0
-"""Neither are edges lower than this many grey levels."""
+"""Edges lower than this many grey levels are not used to measure the blur."""
 MIN_QUALITY = 0.2
 """Hypotheses of a lower quality are found in any clutter, so they explain nothing."""
 FITTING_QUALITY = 0.5
