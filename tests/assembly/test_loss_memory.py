@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from arview.assembly.loss_memory import KnownBefore, LossMemory
+from arview.assembly.loss_memory import BRIEF_FRAMES, CARRIED_SHARE, KnownBefore, LossMemory
 from arview.assembly.monitor import AssemblyMonitor
 from arview.assembly.turned_poses import Turn, TurnEvidence
 from arview.geometry import Array, exp_so3, rigid
@@ -16,7 +16,6 @@ from helpers.synthetic import CAMERA, assembly, assembly_views, pose_from
 
 NAMES = tuple(one.name for one in assembly().components)
 POSE = pose_from(10, 45, 520)
-BRIEF = LossMemoryOptions().brief_frames
 
 
 @cache
@@ -63,7 +62,7 @@ def test_a_part_that_lies_as_before_is_known_at_once() -> None:
 
 @pytest.mark.parametrize(
     ("turn_deg", "frames_lost"),
-    [(180.0, 6), (90.0, 6), (20.0, BRIEF + 1)],
+    [(180.0, 6), (90.0, 6), (20.0, BRIEF_FRAMES + 1)],
     ids=["half a turn", "a quarter turn", "a long loss"],
 )
 def test_a_part_that_may_have_been_turned_is_open_again(turn_deg: float, frames_lost: int) -> None:
@@ -77,8 +76,7 @@ def test_what_was_sure_before_the_loss_holds_again_when_the_part_was_found_turne
     found = known_bare()
     lost_and_found(found, POSE @ upright(found).model_from_model, 6)
     found.turn(upright(found))
-    share = LossMemoryOptions().carried_share
-    assert np.allclose(found._state.log_odds[1:], share * 5.5)
+    assert np.allclose(found._state.log_odds[1:], CARRIED_SHARE * 5.5)
     assert found._state.is_missing[1:].all()
     # The same turn where nothing had ruled it out before: nothing is known of places that were not looked at.
     found = known_bare()
@@ -101,7 +99,7 @@ def test_a_bare_base_is_found_as_it_lay_before_a_short_loss() -> None:
     memory.set_aside(KnownBefore(monitor()._state, frozenset(), frozenset(), True), POSE)
     best = turned.best(POSE @ half, lambda pose: nothing, lambda pose: memory.is_as_before(pose, 4))
     assert np.allclose(best, POSE, atol=1e-6)
-    best = turned.best(POSE @ half, lambda pose: nothing, lambda pose: memory.is_as_before(pose, BRIEF + 1))
+    best = turned.best(POSE @ half, lambda pose: nothing, lambda pose: memory.is_as_before(pose, BRIEF_FRAMES + 1))
     assert np.allclose(best, POSE @ half)
     # What the picture shows of the components counts for more.
     seen = TurnEvidence(np.where(np.arange(len(NAMES)) > 0, 2.0, 0.0), 0.8)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from arview.assembly.monitor import AssemblyMonitor
+from arview.assembly.monitor import OPEN_FRAMES, SUSPECT_FRAMES, AssemblyMonitor
 from arview.assembly.observation import Observation
 from arview.cad.model import Model
 from arview.geometry import Array, apply
@@ -167,7 +167,7 @@ def test_a_displaced_component_stays_mismatched_when_seen_along_its_displacement
         for k, ratio in enumerate(ratios):
             against = np.where(np.arange(count) == 2, ratio, 0.0)
             monkeypatch.setattr(seen, "observe", lambda *_: said(against))  # noqa: B023
-            for _ in range(OPTIONS.suspect_frames):
+            for _ in range(SUSPECT_FRAMES):
                 seen.update(np.zeros((480, 640, 3), np.uint8), pose_from(-70 + 10 * k, 45, 520))
         return seen.mismatches
 
@@ -192,7 +192,7 @@ def test_evidence_of_blurred_pictures_is_soon_outweighed_from_the_same_direction
     for _ in range(2):
         seen.update(blank, pose)
     assert len(seen.mismatches) == 1
-    for _ in range(4 * OPTIONS.suspect_frames):
+    for _ in range(4 * SUSPECT_FRAMES):
         seen.update(blank, pose)
     assert seen.mismatches == () and seen.uncertain == ()
 
@@ -212,7 +212,7 @@ def test_one_frame_alone_reports_no_mismatch(
     assert (len(seen.mismatches) == 1) == is_mismatched
 
 
-@pytest.mark.parametrize(("was_visible", "frames"), [(True, OPTIONS.open_frames), (False, OPTIONS.suspect_frames)])
+@pytest.mark.parametrize(("was_visible", "frames"), [(True, OPEN_FRAMES), (False, SUSPECT_FRAMES)])
 def test_a_component_entering_the_view_is_observed_soon(
     monkeypatch: pytest.MonkeyPatch, was_visible: bool, frames: int
 ) -> None:
@@ -262,7 +262,7 @@ def test_a_component_is_unverified_until_it_is_confirmed_at_its_place(is_there: 
         seen.update(image, pose)
     assert "block_2" in seen.unverified and len(seen.unverified) < len(assembly_views().component_names)
     for image, pose in frames[3:]:
-        for _ in range(OPTIONS.suspect_frames):
+        for _ in range(SUSPECT_FRAMES):
             seen.update(image, pose)
     assert ("block_2" in seen.unverified) != is_there
     assert not set(seen.unverified) - {"block_2"}

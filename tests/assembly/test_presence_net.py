@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from arview.assembly.presence_net import (
     GLOBALS,
+    RADIUS_PX,
     SIDE_PX,
     ComponentCrop,
     PartImage,
@@ -96,7 +97,7 @@ def test_a_crop_shows_the_component_where_it_is() -> None:
     pixels = CAMERA.project(apply(pose, part.vertices_in_model))
     assert crop.size_px == pytest.approx(float(np.ptp(pixels, axis=0).max()), abs=2.0)
     hull = cv2.convexHull(pixels.astype(np.float32))
-    zoom = 2.0 * ComponentCropOptions().radius_px / crop.size_px
+    zoom = 2.0 * RADIUS_PX / crop.size_px
     middle = 0.5 * (pixels.min(axis=0) + pixels.max(axis=0))
     corners = ((hull[:, 0] - middle) * zoom + 0.5 * (SIDE_PX - 1)) * 16.0
     mask = np.zeros((SIDE_PX, SIDE_PX), np.uint8)

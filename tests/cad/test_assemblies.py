@@ -17,7 +17,7 @@ from arview.cad.equal_shapes import ShapeSymmetries
 from arview.cad.model import Component, make_model
 from arview.cad.part import ComponentSettings, Part
 from arview.cad.part_file import load_part
-from arview.cad.tolerance_check import tolerance_remarks
+from arview.cad.tolerance_check import EXPECTED_U_PX, tolerance_remarks
 from arview.cli import main
 from helpers.cad_files import box, glb_with_boxes
 
@@ -101,10 +101,11 @@ def test_symmetries_of_equal_shapes_are_moved_along() -> None:
     np.testing.assert_allclose(third[0].symmetry.through_in_model, turned.bounds_in_model.mean(axis=0), atol=1e-6)
 
 
-def test_the_search_for_symmetries_is_limited_and_says_so() -> None:
+def test_the_search_for_symmetries_is_limited_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     one, other = assembly(2).model.components
     wide = replace(other, name="wide", vertices_in_model=other.vertices_in_model * [2.0, 1.0, 1.0])
-    shapes = ShapeSymmetries(ShapeSearchOptions(max_shapes=1))
+    monkeypatch.setattr("arview.cad.equal_shapes.MAX_SHAPES", 1)
+    shapes = ShapeSymmetries()
     assert shapes.of(one)
     assert shapes.of(other)
     assert shapes.of(wide) == ()
@@ -123,7 +124,7 @@ def test_tolerances_that_cannot_be_meant(changes: dict[str, Any], expected: str)
     remarks = tolerance_remarks(settings, (50.0, 8.0, 8.0), 0.4)
     assert bool(remarks) == bool(expected)
     assert not expected or expected in f"{remarks[0].name} {remarks[0].text}"
-    assert ToleranceCheckOptions().expected_u_px * 0.4 > 0.01
+    assert EXPECTED_U_PX * 0.4 > 0.01
 
 
 def test_distances_in_metres_are_asked_about(tmp_path: Path) -> None:

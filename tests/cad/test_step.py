@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from arview.cad import load_part
+from arview.cad.formats import limited_process
 from arview.cad.formats.step import StepLimits, read_step
 from arview.cad.load import load_cad, load_model
 from arview.errors import InputError
@@ -136,17 +137,21 @@ def test_hostile_text_is_refused_at_once(body: str, expected: str, tmp_path: Pat
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("limits", "expected"),
+    ("limits", "constants", "expected"),
     [
-        (StepLimits(cpu_s=20.0, wall_factor=1e-4), "did not read it in 2[01] s"),
-        (StepLimits(memory_mb=150.0), "more than 0.2 GB of memory"),
-        (StepLimits(output_mb=0.0001), "broken or truncated STEP"),
+        (StepLimits(cpu_s=20.0), {"WALL_FACTOR": 1e-4}, "did not read it in 2[01] s"),
+        (StepLimits(memory_mb=150.0), {}, "more than 0.2 GB of memory"),
+        (StepLimits(), {"OUTPUT_MB": 0.0001}, "broken or truncated STEP"),
     ],
     ids=["time", "memory", "output"],
 )
-def test_limits_of_the_reading_process(limits: StepLimits, expected: str, tmp_path: Path) -> None:
+def test_limits_of_the_reading_process(
+    limits: StepLimits, constants: dict[str, float], expected: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path = StepWriter().write(tmp_path / "f.step", StepBodies("fixture", FIXTURE))
     assert len(read_step(path, 0.1, 10.0, False).components) == 3
+    for name, value in constants.items():
+        monkeypatch.setattr(limited_process, name, value)
     with pytest.raises(InputError, match=expected) as caught:
         read_step(path, 0.1, 10.0, False, limits)
     assert "\n" not in str(caught.value)
@@ -162,12 +167,13 @@ def test_a_placeholder_of_the_writer_is_no_name(tmp_path: Path) -> None:
     assert [one.name for one in load_model(path).components] == ["root", "post"]
 
 
-def test_a_tolerance_that_is_too_fine_is_named(tmp_path: Path) -> None:
+def test_a_tolerance_that_is_too_fine_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = StepWriter().write(tmp_path / "chip.step", StepPart("chip", (20, 10, 5)))
     with pytest.raises(InputError, match=r"^tol_linear_mm = 1e-09 makes too many triangles; give at least 0\.0001 mm"):
         load_model(path, tol_linear_mm=1e-9)
     (tmp_path / "part.toml").write_text('[part]\ncad = "chip.step"\ntol_angular_deg = 1e-6\n')
     with pytest.raises(InputError, match=r"part\.toml: \[part\] tol_angular_deg = 1e-06 makes too many"):
         load_part(tmp_path / "part.toml")
+    monkeypatch.setattr(limited_process, "OUTPUT_MB", 0.0001)
     with pytest.raises(InputError, match=r"could not triangulate it with tol_linear_mm = 0\.001"):
-        read_step(path, 0.001, 10.0, False, StepLimits(output_mb=0.0001))
+        read_step(path, 0.001, 10.0, False)

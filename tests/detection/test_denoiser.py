@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from arview.detection.features.denoiser import Denoiser, noise_level
+from arview.detection.features.denoiser import BAND_ROWS, MIN_NOISE, Denoiser, noise_level
 from arview.detection.search.local_search import LocalSearch
 from helpers.synthetic import CAMERA, assembly_views, background, pose_from
 from helpers.synthetic import picture as drawn
@@ -94,7 +94,7 @@ def test_images_with_little_noise_are_returned_unchanged() -> None:
     image = cv2.GaussianBlur(drawn(POSE, noise=0.0), (0, 0), 0.7)
     for noise in (0.0, 1.5):
         grainy = noisy(image, noise)
-        assert noise_level(grainy) < DenoiserOptions().min_noise
+        assert noise_level(grainy) < MIN_NOISE
         assert network().denoise(grainy) is grainy
 
 
@@ -105,11 +105,12 @@ def test_any_size_is_denoised(size: tuple[int, int]) -> None:
     assert np.std(clean.astype(float)) < 11.0
 
 
-def test_bands_leave_no_seams() -> None:
+def test_bands_leave_no_seams(monkeypatch: pytest.MonkeyPatch) -> None:
     image = noisy(drawn(POSE, noise=0.0), 12.0)
-    assert image.shape[0] == CAMERA.height <= DenoiserOptions().band_rows
+    assert image.shape[0] == CAMERA.height <= BAND_ROWS
     whole = network().denoise(image)
-    banded = Denoiser(DenoiserOptions(band_rows=96)).denoise(image)
+    monkeypatch.setattr("arview.detection.features.denoiser.BAND_ROWS", 96)
+    banded = Denoiser().denoise(image)
     assert np.max(np.abs(banded.astype(int) - whole)) <= 1
 
 

@@ -16,16 +16,16 @@ from arview.detection.features.image_pyramid import ImagePyramid
 from arview.detection.search.global_search import (
     GRADIENTS_ONLY,
     QUICK,
+    RESPONSE_WEIGHT,
     UNTRIMMED,
     WIDE,
     CandidatePoses,
-    GlobalSearchOptions,
     PoseCandidate,
     SearchBudget,
     search_distances_mm,
 )
 from arview.detection.search.hypothesis import Hypothesis
-from arview.detection.search.local_search import LocalSearchOptions
+from arview.detection.search.local_search import PREVIOUS_WEIGHT
 from arview.detection.search.template_bank import DOMAIN_DIRECTION, in_fundamental_domain
 from arview.detection.symmetry import edge_margin, find_rotational_symmetries
 from arview.errors import InputError
@@ -425,7 +425,7 @@ def test_responses_rank_poses_of_equal_profile_score() -> None:
     alike = CandidatePoses(np.stack([pose] * 3), np.full(3, 12.0), responses)
     found = detector().global_search.rank(seen, alike)
     scores = [candidate.score for candidate in found]
-    assert scores[0] - scores[1] == pytest.approx(0.3 * GlobalSearchOptions().response_weight) and scores[1] > scores[2]
+    assert scores[0] - scores[1] == pytest.approx(0.3 * RESPONSE_WEIGHT) and scores[1] > scores[2]
 
 
 def test_matches_outside_the_distances_give_no_detection(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -482,5 +482,5 @@ def test_the_score_of_one_level_counts_at_the_next() -> None:
     )
     alone = detector().local.pattern_search(seen, [PoseCandidate(0.0, poses[-1])])
     np.testing.assert_allclose(found[0].cam_from_body, alone[0].cam_from_body, atol=1e-9)
-    assert found[0].score == pytest.approx(alone[0].score + 1000.0 * LocalSearchOptions().previous_weight ** 2)
+    assert found[0].score == pytest.approx(alone[0].score + 1000.0 * PREVIOUS_WEIGHT**2)
     assert not np.allclose(plain[0].cam_from_body, alone[0].cam_from_body, atol=1e-3)

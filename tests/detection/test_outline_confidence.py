@@ -6,7 +6,14 @@ from dataclasses import replace
 
 import pytest
 
-from arview.detection.confidence import ConfidenceTerms, Margins, confidence_terms, outline_score, pose_probability
+from arview.detection.confidence import (
+    MIN_OUTLINE,
+    ConfidenceTerms,
+    Margins,
+    confidence_terms,
+    outline_score,
+    pose_probability,
+)
 from arview.refinement.evidence import PoseEvidence
 
 CLEAR = PoseEvidence(
@@ -57,7 +64,7 @@ def test_a_strong_competitor_at_the_same_place_leaves_it_open() -> None:
     ids=["other colours", "no design edges", "no outline", "a drifting outline"],
 )
 def test_the_outline_confirms_nothing_where_something_contradicts(evidence: PoseEvidence, contour: float) -> None:
-    assert outline_score(evidence, evidence, contour) < CONFIDENCE.min_outline
+    assert outline_score(evidence, evidence, contour) < MIN_OUTLINE
 
 
 def test_a_part_without_design_edges_need_not_show_any() -> None:

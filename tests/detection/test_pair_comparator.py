@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from arview.cad import Model, make_model
 from arview.cad.view_range import ViewRange
+from arview.detection.disambiguation import MIN_MARGIN
 from arview.detection.features.edge_net import EdgeNet
 from arview.detection.features.image_pyramid import ImagePyramid
 from arview.detection.scoring.pair_comparator import PairComparator
@@ -75,7 +76,7 @@ def test_an_image_without_the_part_gives_no_decision() -> None:
     flat = np.clip(np.random.default_rng(0).normal(120.0, 4.0, (CAMERA.height, CAMERA.width, 3)), 0, 255)
     seen = ImagePyramid(flat.astype(np.uint8), CAMERA, 12, EdgeNet())
     odds = PairComparator(part_of(10.0)).log_odds(seen, symmetric_poses(truth, 10.0))
-    assert np.abs(odds).max() < DisambiguationOptions().min_margin, np.round(odds, 1)
+    assert np.abs(odds).max() < MIN_MARGIN, np.round(odds, 1)
 
 
 def test_exactly_symmetric_poses_have_equal_odds() -> None:

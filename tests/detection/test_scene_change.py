@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from arview.cad.view_range import ViewRange
-from arview.detection.scene_change import SceneChange
+from arview.detection.scene_change import MIN_DIFFERENCE, SceneChange
 from arview.guideviews import GuideViewOptions, make_guide_views
 from helpers.synthetic import CAMERA, RANGE, assembly, assembly_views, picture, pose_from
 
@@ -56,7 +56,7 @@ def test_the_changed_share_is_that_of_the_area() -> None:
     assert compared.changed_share(small[0], small[1]) == pytest.approx(240 * 160 / (480 * 640), rel=0.02)
     assert compared.changed_share(small[0], small[0]) == 0.0
     # Lighter by less than the threshold is none.
-    after[120:360, 160:320] = 90 + SceneChangeOptions().min_difference - 1
+    after[120:360, 160:320] = 90 + MIN_DIFFERENCE - 1
     assert compared.changed_share(small[0], compared.reduced(after)) == 0.0
 
 

@@ -14,7 +14,7 @@ from arview.cad.view_range import ViewRange
 from arview.camera import Camera
 from arview.camera.read import guess_camera
 from arview.detection import Detector
-from arview.detection.detector import DetectorOptions
+from arview.detection.detector import GLOBAL_SEARCH
 from arview.detection.search.global_search import GlobalSearch
 from arview.geometry import Array, apply, exp_so3, rigid
 from arview.guideviews import GuideViewOptions, GuideViewSet
@@ -94,7 +94,7 @@ def test_usual_sizes_are_searched_as_fast_as_over_a_range_of_their_own() -> None
 @pytest.mark.slow
 def test_only_a_wide_range_is_searched_in_two_parts() -> None:
     part = PartView(views())
-    search = GlobalSearch(views(), part, CAMERA, DetectorOptions().global_search, np.empty((0, 3, 3)))
+    search = GlobalSearch(views(), part, CAMERA, GLOBAL_SEARCH, np.empty((0, 3, 3)))
     assert search.has_outer and len(search.banks) <= 20
     spans_px = [CAMERA.fx * DIAMETER_MM / distance for distance in search._distances_mm]
     assert spans_px[0] > CAMERA.width and 45.0 < spans_px[1] < 60.0

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import cache
 from typing import Any
 
 import cv2
 import numpy as np
+import pytest
 
 from arview.geometry import Array
 from arview.station.live.options import LiveOptions, RequestLimits
+from arview.station.live.security import connections
+from arview.station.live.server import app, hub
 from arview.station.live.server.loading import load_subjects
 from arview.station.live.stream.subjects import Subjects
 from arview.video import Image, open_source
@@ -44,16 +48,25 @@ def there_and_back() -> list[int]:
     return [*range(COUNT), *range(COUNT - 2, 0, -1)]
 
 
+@contextmanager
+def patience() -> Iterator[None]:
+    """Servers accept any rate of handshakes and wait longer than usual, because tests share their cores."""
+    with pytest.MonkeyPatch.context() as patched:
+        for name in ("HANDSHAKES_PER_S", "HANDSHAKES_BURST"):
+            patched.setattr(connections, name, 1e6)
+        patched.setattr(hub, "JPEG_SILENCE_S", 120.0)
+        patched.setattr(hub, "CONNECT_TIMEOUT_S", 60.0)
+        patched.setattr(app, "TRACKING_TIMEOUT_S", 60.0)
+        yield
+
+
 def options(**more: Any) -> LiveOptions:
-    """Options of a server that shows the sample to phones, without rate limits and with long timeouts."""
+    """Options of a server that shows the sample to phones, without rate limits; `patience` does the rest."""
     usual: dict[str, Any] = {
         "camera": str(CAMERA), "inspections": (INSPECTION,), "width": WIDTH, "height": HEIGHT,
         "requests": RequestLimits(
             per_s=1e6, burst=1e6, strangers_per_s=1e6, strangers_burst=1e6, joins_per_s=1e6, joins_burst=1e6
         ),
-        "connections": ConnectionLimits(handshakes_per_s=1e6, handshakes_burst=1e6),
-        "jpeg_silence_s": 120.0, "tracking_timeout_s": 60.0,  # tests share their cores
-        "webrtc": WebrtcOptions(connect_timeout_s=60.0),
     }  # fmt: skip
     if "inspection" in more:
         more["inspections"] = () if (path := more.pop("inspection")) is None else (path,)

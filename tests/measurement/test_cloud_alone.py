@@ -15,6 +15,7 @@ from arview.cli import ExitCode, main
 from arview.errors import InputError
 from arview.geometry import Array, apply, exp_so3, invert, rigid
 from arview.inspection import Inspection, load_inspection
+from arview.measurement.cloud import global_registration
 from arview.measurement.cloud.global_registration import find_model_in_cloud
 from arview.measurement.cloud.mesh_surface import MeshSurface
 from arview.measurement.datums.in_cloud import measure_datums_in_cloud
@@ -29,7 +30,13 @@ from helpers.plate_scene import part as plate_part
 NOISE_MM = 0.04
 PLACE = rigid(exp_so3(np.array([0.9, -1.4, 0.6])), [120.0, -300.0, 800.0])
 """scan_from_model."""
-QUICK = GlobalRegistrationOptions(points=2000, voxels=28, step_deg=8.0)
+
+
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A coarser search than usual, for time."""
+    for name, value in {"POINTS": 2000, "VOXELS": 28, "STEP_DEG": 8.0}.items():
+        monkeypatch.setattr(global_registration, name, value)
 
 
 def scan(model: Model, place: Array = PLACE, count: int = 60_000, seed: int = 0, scale: float = 1.0) -> DenseCloud:
@@ -56,6 +63,7 @@ def off_mm(found_from_scan: Array, scale: float = 1.0, true_scale: float = 1.0) 
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("quick")
 @pytest.mark.parametrize("has_normals", [True, False])
 def test_the_part_is_found_and_not_half_a_turn_round(has_normals: bool) -> None:
     """The plate is symmetric, the blocks differ by millimetres, one is missing, and two stand elsewhere."""
@@ -67,7 +75,9 @@ def test_the_part_is_found_and_not_half_a_turn_round(has_normals: bool) -> None:
 
 
 @pytest.mark.slow
-def test_the_scale_is_found_too() -> None:
+@pytest.mark.usefixtures("quick")
+def test_the_scale_is_found_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(global_registration, "SCALE_RANGE", (0.85, 1.2))
     cloud = scan(as_built(), scale=37.0)
     found = find_model_in_cloud(cloud, nominal(), None)
     assert found.scale == pytest.approx(37.0, rel=1e-3)
@@ -75,6 +85,7 @@ def test_the_scale_is_found_too() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("quick")
 def test_clouds_of_nothing_that_is_known() -> None:
     cloud = scan(as_built())
     mirror = np.array([-1.0, 1.0, 1.0])

@@ -9,6 +9,7 @@ import pytest
 
 from arview.errors import InputError
 from arview.geometry import Array
+from arview.measurement.cloud import placing
 from arview.measurement.cloud.placing import cloud_in_mm
 from arview.measurement.cloud.reading import RawPoints, possible_units, read_points, unit_of_option
 from arview.measurement.folder import read_cloud
@@ -62,9 +63,10 @@ def test_text_with_any_separator(tmp_path: Path) -> None:
     check(tmp_path / "i.asc", "//X Y Z Nx Ny Nz\n" + rows_of(np.column_stack([POINTS, NORMALS])), True)
 
 
-def test_a_block_may_end_inside_a_line(tmp_path: Path) -> None:
+def test_a_block_may_end_inside_a_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("arview.measurement.cloud.reading.text.BLOCK_BYTES", 1000)
     (tmp_path / "a.xyz").write_text(rows_of(POINTS))
-    raw = read_points(tmp_path / "a.xyz", ReadOptions(block_bytes=1000))
+    raw = read_points(tmp_path / "a.xyz")
     assert raw.points + raw.origin == pytest.approx(POINTS, abs=1e-3)
 
 
@@ -188,13 +190,15 @@ def test_units_are_said_and_may_be_given(tmp_path: Path) -> None:
         read_cloud(tmp_path / "b.csv", nominal(), "cm")
 
 
-def test_large_clouds_are_averaged_without_bias() -> None:
+def test_large_clouds_are_averaged_without_bias(monkeypatch: pytest.MonkeyPatch) -> None:
     """Ten points of a noisy plane in each cell: the average lies on the plane, and offsets are kept."""
     rng = np.random.default_rng(1)
     points = np.column_stack([rng.uniform(0.0, 20.0, (60_000, 2)), rng.normal(0.0, 0.05, 60_000)])
     normals = np.tile(np.float32([0, 0, 1]), (60_000, 1))
     raw = RawPoints(points.astype(np.float32), normals, np.array([1e6, 0.0, 3.0]))
-    thin = cloud_in_mm(raw, "mm", ThinningOptions(10_000, 0.5, 16_000))
+    for name, value in {"MAX_POINTS": 10_000, "GRID_MM": 0.5, "CHUNK_POINTS": 16_000}.items():
+        monkeypatch.setattr(placing, name, value)
+    thin = cloud_in_mm(raw, "mm")
     assert 1600 <= len(thin.points) < 6000
     assert thin.points.mean(axis=0) == pytest.approx([1e6 + 10.0, 10.0, 3.0], abs=0.1)
     assert np.abs(thin.points[:, 2].mean() - 3.0) < 0.002

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from arview.measurement.cloud.pair_registration import PairRegistrationOptions, _near_lists
+from arview.measurement.cloud.pair_registration import _near_lists
 from arview.measurement.cloud.scene_points import ScenePoints
 
 
@@ -15,10 +15,11 @@ def scene(count: int, weights: np.ndarray, rng: np.random.Generator) -> ScenePoi
 
 
 @pytest.mark.parametrize("block", [1, 7000, 2_000_000])
-def test_all_near_points_are_listed_once_where_there_is_room(block: int) -> None:
+def test_all_near_points_are_listed_once_where_there_is_room(block: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("arview.measurement.cloud.pair_registration.LIST_BLOCK", block)
     rng = np.random.default_rng(1)
     cloud = scene(400, np.ones(400), rng)
-    lists = _near_lists(cloud, 100.0, PairRegistrationOptions(list_block=block), rng)
+    lists = _near_lists(cloud, 100.0, rng)
     apart = np.linalg.norm(cloud.points[:, None] - cloud.points[None], axis=2)
     for listed, distances in zip(lists, apart, strict=True):
         near = np.flatnonzero(distances <= 60.0)

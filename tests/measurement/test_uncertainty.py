@@ -40,7 +40,13 @@ from helpers.photo_scene import CAMERA, bench, ring
 
 RADIUS_MM = 22.0
 CENTER = np.array([60.0, -40.0, 20.0])
-BARE = UncertaintyOptions(form_mm=1e-6, min_poses_mm=1e-6)
+
+
+@pytest.fixture
+def bare(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing but what is measured counts: no form, no least error of the poses."""
+    for name in ("FORM_MM", "MIN_POSES_MM"):
+        monkeypatch.setattr(f"arview.measurement.uncertainty.budget.{name}", 1e-6)
 
 
 def move(
@@ -194,11 +200,12 @@ def test_what_one_method_leaves_open_the_other_fills() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("bare")
 @pytest.mark.parametrize("monte_carlo", [True, False])
 def test_intervals_hold_the_truth_as_often_as_they_say(monte_carlo: bool) -> None:
     """500 components displaced by 0 to 2 mm, each with its own noise, measured in a frame that is measured too."""
     rng = np.random.default_rng(3)
-    options = replace(BARE, monte_carlo=monte_carlo, draws=2000)
+    options = UncertaintyOptions(monte_carlo=monte_carlo, draws=2000)
     inside, per_axis, at_zero = [], [], []
     for index in range(500 if monte_carlo else 250):
         length = [0.0, 0.0, 0.03, 0.1, 0.5, 2.0][index % 6]
@@ -251,6 +258,7 @@ def test_the_budget_sums_and_names_the_largest() -> None:
     assert again.distance == found.distance  # seeded
 
 
+@pytest.mark.usefixtures("bare")
 def test_large_turns_of_frame_and_component() -> None:
     """Exact where the twists are large: a part 1.5° askew, a component tilted by 5°."""
     rng = np.random.default_rng(5)
@@ -263,7 +271,7 @@ def test_large_turns_of_frame_and_component() -> None:
     center = apply(carried, CENTER + np.array([0.3, -0.2, 0.1])) - CENTER
     turn = log_so3(carried[:3, :3] @ exp_so3(true))
     c = np.diag([1e-5] * 3 + [1e-4] * 3) ** 2
-    found = place(combine([move(np.concatenate([turn, center]), c)]), alignment, options=BARE)
+    found = place(combine([move(np.concatenate([turn, center]), c)]), alignment)
     assert found.twist[3:] == pytest.approx([0.3, -0.2, 0.1], abs=1e-9)
     assert np.rad2deg(found.twist[:3] - true) == pytest.approx(0.0, abs=0.02)
 

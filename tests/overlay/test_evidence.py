@@ -22,7 +22,7 @@ from arview.overlay.status import completeness_text
 from arview.pose import ComponentPresence, Identity, Pose, Presence, Visibility
 
 MOVED = rigid(np.eye(3), [40.0, 0.0, 0.0])
-BARE = {"show_labels": False, "show_arrows": False, "show_status": False, "show_legend": False}
+BARE = {"show_labels": False, "show_status": False, "show_legend": False}
 
 
 @pytest.fixture(scope="module")
@@ -112,6 +112,7 @@ def test_texts_by_evidence(record: Inspection) -> None:
     assert (withheld.value, withheld.word, withheld.verdict) == ("", "WITHHELD", None)
 
 
+@pytest.mark.usefixtures("no_arrows")
 def test_a_missing_component_is_hatched(model: Model, record: Inspection) -> None:
     options = OverlayOptions(show_edges="none", **BARE)
     renderer = OverlayRenderer(model, CAMERA, record, options)
@@ -128,6 +129,7 @@ def test_a_missing_component_is_hatched(model: Model, record: Inspection) -> Non
         assert np.array_equal(changed(renderer.draw(GREY, posed(), now=NOW))[there] > 5, np.ones_like(strong))
 
 
+@pytest.mark.usefixtures("no_arrows")
 def test_a_displaced_component_is_drawn_at_both_places(model: Model, record: Inspection) -> None:
     options = OverlayOptions(show_edges="none", **BARE)
     moved = rigid(np.eye(3), [0.0, 45.0, 0.0])
@@ -143,6 +145,7 @@ def test_a_displaced_component_is_drawn_at_both_places(model: Model, record: Ins
     assert without.mean() < changed(picture)[place_of("p1", model, moved)].mean()
 
 
+@pytest.mark.usefixtures("no_arrows")
 def test_the_outline_of_an_unverified_component_is_dashed(model: Model) -> None:
     options = OverlayOptions(show_ghost=False, **BARE)
     renderer = OverlayRenderer(model, CAMERA, options=options)

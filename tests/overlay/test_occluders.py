@@ -119,10 +119,11 @@ def test_light_and_noise_are_no_occluder() -> None:
     assert lost < 0.002
 
 
+@pytest.mark.usefixtures("no_arrows")
 def test_the_ghost_is_left_out_where_something_hides_the_part() -> None:
     scene = Scene(CAMERA)
     record = inspection(scene.model, deviation("a", (0.03, 0, 0), "pass"), deviation("b", (1.0, 0, 0), "fail"))
-    options = OverlayOptions(show_status=False, show_labels=False, show_arrows=False)
+    options = OverlayOptions(show_status=False, show_labels=False)
     renderers = {
         True: OverlayRenderer(scene.model, CAMERA, record, options),
         False: OverlayRenderer(

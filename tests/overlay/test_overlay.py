@@ -33,7 +33,7 @@ CAMERA = Camera(640, 480, 700.0, 700.0, 319.5, 239.5)
 LENS = Camera(640, 480, 500.0, 500.0, 319.5, 239.5, np.array([-0.28, 0.09, 0.001, -0.002, 0.0]))
 GREY = np.full((480, 640, 3), 118, dtype=np.uint8)
 NOW = datetime(2026, 3, 1, 14, tzinfo=UTC)
-BARE = {"show_labels": False, "show_arrows": False, "show_status": False}
+BARE = {"show_labels": False, "show_status": False}
 GHOST_ONLY = OverlayOptions(show_edges="none", opacity=1.0, **BARE)
 EDGES_ONLY = OverlayOptions(show_ghost=False, **BARE)
 SEEN = (True,) * 6
@@ -113,6 +113,7 @@ def outline_mask(points_px: Array) -> NDArray[np.uint8]:
 
 @pytest.mark.parametrize("camera", [CAMERA, LENS], ids=["pinhole", "lens"])
 @pytest.mark.parametrize("azimuth_deg", [10.0, 77.0, 200.0])
+@pytest.mark.usefixtures("no_arrows")
 def test_ghost_is_within_a_pixel_of_the_projected_outline(camera: Camera, azimuth_deg: float) -> None:
     model = make_model("m", (box("a", (10, 5, 0), (160, 90, 40)),))
     cam_from_model = orbit(azimuth_deg, 35.0, 480.0)
@@ -130,6 +131,7 @@ def test_ghost_is_within_a_pixel_of_the_projected_outline(camera: Camera, azimut
 
 
 @pytest.mark.parametrize("camera", [CAMERA, LENS], ids=["pinhole", "lens"])
+@pytest.mark.usefixtures("no_arrows")
 def test_edges_follow_the_projection(camera: Camera) -> None:
     model = make_model("m", (box("a", (60, 30, 0), (200, 120, 60)),))
     cam_from_model = orbit(30.0, 40.0, 480.0)
@@ -151,6 +153,7 @@ def test_edges_follow_the_projection(camera: Camera) -> None:
     assert cv2.distanceTransform(canvas, cv2.DIST_L2, 5)[drawn].max() <= 4.0
 
 
+@pytest.mark.usefixtures("no_arrows")
 def test_hidden_components_leave_no_trace() -> None:
     wall, behind = box("wall", (0, 60, 0), (200, 10, 120)), box("behind", (0, -60, 0), (60, 30, 40))
     model = make_model("m", (wall, behind))
@@ -167,6 +170,7 @@ def test_hidden_components_leave_no_trace() -> None:
     assert dashed[v0:v1, u0:u1].sum() > 50
 
 
+@pytest.mark.usefixtures("no_arrows")
 def test_cylinder_shows_its_silhouette_and_no_facets() -> None:
     model = make_model("m", (post("p", 0.0, 0.0, 30.0, 100.0),))
     cam_from_model = look_at([600.0, 0.0, 50.0], [0.0, 0.0, 50.0], [0.0, 0.0, 1.0])
@@ -177,6 +181,7 @@ def test_cylinder_shows_its_silhouette_and_no_facets() -> None:
     assert row.min() < 319 < row.max()
 
 
+@pytest.mark.usefixtures("no_arrows")
 def test_colours_show_the_verdict() -> None:
     centers = [(-90, 0, 0), (-30, 0, 0), (30, 0, 0), (90, 0, 0)]
     model = make_model("m", tuple(box(f"b{i}", c, (40, 40, 40)) for i, c in enumerate(centers)))
@@ -203,7 +208,7 @@ def test_colours_show_the_verdict() -> None:
         assert max(fit, key=fit.__getitem__) is verdict
 
 
-def test_label_texts_come_from_the_inspection() -> None:
+def test_label_texts_come_from_the_inspection(monkeypatch: pytest.MonkeyPatch) -> None:
     failed = deviation("post_3", (1.0, -0.61, 0.05), "fail")
     assert labels.value_text(failed) == "1.17 mm"
     assert labels.detail_text(failed) == "dx +1.00  dy −0.61   U 0.12"
@@ -218,6 +223,8 @@ def test_label_texts_come_from_the_inspection() -> None:
     rough = replace(failed, uncertainty_mm=2.34)
     assert labels.value_text(rough) == "1.2 mm"  # no more decimals than U allows
     assert labels.detail_text(rough) == "U 2.3"
+    monkeypatch.setattr(labels, "UNIT", "inch")
+    monkeypatch.setattr(labels, "DECIMALS", 3)
     assert labels.value_text(deviation("a", (0.0, 25.4, 0.0), "fail")) == "1.000 in"
 
 
@@ -316,10 +323,8 @@ def test_refusals(plate: Model, record: Inspection) -> None:
         OverlayRenderer(plate, CAMERA).draw(np.zeros((720, 1280, 3), np.uint8), pose(None))
     for bad in (
         {"opacity": 1.5},
-        {"decimals": 9},
         {"show_edges": "some"},
         {"arrow_scale": 0.0},
-        {"unit": "m"},
     ):
         with pytest.raises(InputError, match=next(iter(bad))):
             OverlayOptions(**bad)  # type: ignore[arg-type]
@@ -335,6 +340,7 @@ def test_unusual_poses_are_drawn_without_error(plate: Model, record: Inspection,
         renderer.draw(GREY, pose(rigid(front[:3, :3], [x, 0.0, 600.0])))
 
 
+@pytest.mark.usefixtures("no_arrows")
 def test_meshes_that_are_open_or_inside_out_are_drawn() -> None:
     closed = trimesh.creation.box((80, 80, 80))
     for faces in (closed.faces[:, ::-1], closed.faces[:-1], closed.faces[:-1, ::-1]):
@@ -463,6 +469,7 @@ def test_labels_avoid_covering_components() -> None:
 
 @pytest.mark.shared
 @pytest.mark.parametrize("index", [0, 150])
+@pytest.mark.usefixtures("no_arrows")
 def test_edges_lie_on_the_edges_of_a_real_frame(index: int) -> None:
     scene = trimesh.load(PLATE / "models" / "assembly.glb")
     components = []

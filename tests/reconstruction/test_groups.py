@@ -55,11 +55,12 @@ def test_groups_without_a_common_point() -> None:
     assert linked_groups(sparse) == ((3, 4, 5, 6, 7), (0, 1, 2))
 
 
-def test_too_few_common_points_are_no_link() -> None:
+def test_too_few_common_points_are_no_link(monkeypatch: pytest.MonkeyPatch) -> None:
     """Ten points that two photos of the two groups both see may be due to chance."""
     sparse = model_of([(range(4), range(210)), (range(4, 8), range(200, 400))])
     assert linked_groups(sparse) == ((0, 1, 2, 3), (4, 5, 6, 7))
-    assert len(linked_groups(sparse, GroupOptions(min_shared_points=10))) == 1
+    monkeypatch.setattr("arview.reconstruction.groups.MIN_SHARED_POINTS", 10)
+    assert len(linked_groups(sparse)) == 1
 
 
 def test_a_link_that_leaves_the_groups_free_to_move() -> None:
@@ -70,12 +71,13 @@ def test_a_link_that_leaves_the_groups_free_to_move() -> None:
     assert linked_groups(moved_part(sparse, [5, 6, 7], free)) == ((0, 1, 2, 3, 4), (5, 6, 7))
 
 
-def test_relative_deviation_is_that_of_the_pixels() -> None:
+def test_relative_deviation_is_that_of_the_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
     """Against a Monte Carlo of the smaller part's common move, seen in its photos."""
     sparse = model_of([(range(5), range(240)), (range(5, 8), range(200, 400))], pose_std=1e-9)
     std = np.array([2e-3, 3e-3, 1e-3, 0.5, 0.2, 0.8, 2e-3])
     sparse = moved_part(sparse, [5, 6, 7], std)
-    predicted = relative_px(sparse, ((0, 1, 2, 3, 4), (5, 6, 7)), GroupOptions(points_of_photo=400))
+    monkeypatch.setattr("arview.reconstruction.groups.POINTS_OF_PHOTO", 400)
+    predicted = relative_px(sparse, ((0, 1, 2, 3, 4), (5, 6, 7)))
     shifts = []
     for move in RNG.normal(0.0, std, (200, 7)):
         turn = np.eye(3) + np.cross(np.eye(3), -move[:3])

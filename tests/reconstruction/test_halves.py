@@ -17,7 +17,7 @@ from helpers.photo_scene import CAMERA, bench, photograph, ring, write_photos
 
 
 @pytest.mark.slow  # structure from motion of sixteen photos
-def test_halves_are_placed_apart(tmp_path: Path) -> None:
+def test_halves_are_placed_apart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     poses = ring(16)
     paths = write_photos(tmp_path / "photos", [photograph(bench(), pose) for pose in poses])
     guess = Camera(CAMERA.width, CAMERA.height, 740.0, 740.0, CAMERA.cx, CAMERA.cy)
@@ -38,5 +38,6 @@ def test_halves_are_placed_apart(tmp_path: Path) -> None:
         assert half.pose_covariance is not None and half.pose_covariance.shape == (48, 48)
         assert half.photos[0].camera.fx != metric.photos[0].camera.fx
         assert half.photos[0].camera.fx == pytest.approx(metric.photos[0].camera.fx, rel=0.02)
+    monkeypatch.setattr("arview.reconstruction.halves.MIN_PHOTOS", 20)
     with pytest.raises(CannotMeasureError, match="16 photos are too few to be halved"):
-        halves_of(tmp_path / "sparse" / "model", metric, HalvesOptions(min_photos=20))
+        halves_of(tmp_path / "sparse" / "model", metric)

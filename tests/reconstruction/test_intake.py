@@ -14,7 +14,14 @@ from arview.camera.exif import PhotoExif, focal_length_px, read_exif, sensor_wid
 from arview.camera.read import save_camera
 from arview.core.stage_cache import key_of
 from arview.errors import InputError, MismatchError
-from arview.reconstruction.intake import VideoIntakeOptions, intake_frames, intake_photos, intake_video, read_photo
+from arview.reconstruction.intake import (
+    VideoIntakeOptions,
+    intake_frames,
+    intake_photos,
+    intake_video,
+    read_photo,
+    video,
+)
 from arview.reconstruction.intake.checks import blur_and_texture, same_views, thumbnail
 from arview.reconstruction.intake.lenses import Lens, lenses_of
 from arview.reconstruction.intake.reading import glance
@@ -438,13 +445,13 @@ def clip(path: Path, places: list[tuple[int, int]], blurred: set[int] = frozense
 
 
 @pytest.mark.slow
-def test_video_frames_are_sharp_and_spread(tmp_path: Path) -> None:
+def test_video_frames_are_sharp_and_spread(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(video, "LOOKS_PER_S", 30.0)
     places = [(4 * k, 3 * k) for k in range(40)] + [(160, 120)] * 20 + [(160 + 5 * k, 120) for k in range(40)]
     blurred = {k for k in range(100) if k % 3 == 0}
     path = clip(tmp_path / "a.mp4", places, blurred)
-    options = VideoIntakeOptions(looks_per_s=30.0)
     calls: list[tuple[int, int]] = []
-    intake = intake_video(path, tmp_path / "frames", options, progress=lambda done, total: calls.append((done, total)))
+    intake = intake_video(path, tmp_path / "frames", progress=lambda done, total: calls.append((done, total)))
     indices = [int(photo.name[6:12]) for photo in intake.photos]
     assert not blurred & set(indices)
     taken = np.array([places[index] for index in indices], float)
@@ -454,10 +461,10 @@ def test_video_frames_are_sharp_and_spread(tmp_path: Path) -> None:
     assert sum(40 <= index < 60 for index in indices) <= 1  # the pause gives one frame at most
     assert np.abs(read_photo(intake.photos[2].path).astype(int) - view(*places[indices[2]])).mean() < 8
     assert calls[-1][0] <= calls[-1][1] == 200
-    again = intake_frames(path, tmp_path / "frames", options)
+    again = intake_frames(path, tmp_path / "frames")
     assert key_of(again.photos) == key_of(intake.photos)
     assert (again.rejected, again.warnings) == (intake.rejected, intake.warnings)
-    few = intake_video(path, tmp_path / "few", VideoIntakeOptions(max_frames=7, looks_per_s=30.0))
+    few = intake_video(path, tmp_path / "few", VideoIntakeOptions(max_frames=7))
     assert 5 <= len(few.photos) <= 7
     assert sorted(p.name for p in (tmp_path / "few").iterdir()) == sorted(photo.name for photo in few.photos)
 
@@ -471,12 +478,13 @@ def test_static_video_is_refused_in_words(tmp_path: Path) -> None:
         intake_video(clip(tmp_path / "b.mp4", [(0, 0)] * 3), tmp_path / "frames", VideoIntakeOptions(max_frames=0))
 
 
-def test_choice_prefers_the_sharpest_in_the_middle_of_each_step() -> None:
+def test_choice_prefers_the_sharpest_in_the_middle_of_each_step(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(video, "MIN_STEP", 0.01)
     travel = np.linspace(0, 1.0, 101)
     sharpness = np.ones(101)
     sharpness[[12, 37, 61, 88]] = 2.0
     sharpness[25] = 9.0  # at the border of two steps
-    options = VideoIntakeOptions(max_frames=4, min_step=0.01)
+    options = VideoIntakeOptions(max_frames=4)
     assert choose_frames(travel, sharpness, options) == [12, 37, 61, 88]
 
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from arview.errors import InputError
+from arview.reconstruction import pairs
 from arview.reconstruction.features import FeatureOptions, Features, find_features
 from arview.reconstruction.intake.kept import keeping_photos
 from arview.reconstruction.intake.reading import read_photo
@@ -21,7 +22,13 @@ from arview.reconstruction.types import Photo
 from helpers.photo_scene import CAMERA, ring
 
 COUNT = 14
-OPTIONS = PairOptions(preview_features=40, hints_from=COUNT)
+
+
+@pytest.fixture(autouse=True)
+def small_sets(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rough poses choose the pairs of this many photos, and a few features are compared."""
+    monkeypatch.setattr(pairs, "PREVIEW_FEATURES", 40)
+    monkeypatch.setattr(pairs, "HINTS_FROM", COUNT)
 
 
 def photo(name: str, path: Path = Path("none")) -> Photo:
@@ -43,12 +50,13 @@ def unlike() -> list[Features]:
     return found
 
 
-def test_rough_poses_choose_the_pairs() -> None:
+def test_rough_poses_choose_the_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
     poses = ring(COUNT, elevations_deg=(30.0,))
     known = KnownPairs(poses={one.name: pose for one, pose in zip(PHOTOS, poses, strict=True)})
     with ThreadPoolExecutor(2) as pool:
         by_pose = chosen_pairs(PHOTOS, unlike(), known, pool)
         by_look = chosen_pairs(PHOTOS, unlike(), KnownPairs(), pool)
+        monkeypatch.setattr(pairs, "HINTS_FROM", COUNT + 1)
         few = chosen_pairs(PHOTOS, unlike(), known, pool)
     apart = {min(j - i, COUNT - j + i) for i, j in by_pose}
     assert apart == {1, 2} and len(by_pose) == 2 * COUNT  # 26° from photo to photo, less between their axes
@@ -70,13 +78,13 @@ def test_a_photo_with_a_wrong_pose_is_matched_by_its_look() -> None:
 
 
 def test_recorded_pairs_are_matched_and_no_others(tmp_path: Path) -> None:
-    pairs = [(0, 5), (2, 3), (4, 13)]
-    write_pairs(tmp_path / "pairs.json", PHOTOS, pairs)
+    listed = [(0, 5), (2, 3), (4, 13)]
+    write_pairs(tmp_path / "pairs.json", PHOTOS, listed)
     known = read_pairs(tmp_path / "pairs.json")
     with ThreadPoolExecutor(2) as pool:
-        assert chosen_pairs(PHOTOS, unlike(), known, pool) == pairs
+        assert chosen_pairs(PHOTOS, unlike(), known, pool) == listed
         assert chosen_pairs(PHOTOS[:5], unlike()[:5], known, pool) == [(2, 3)]
-        assert doubtful_pairs(PHOTOS, unlike(), known, pairs, [], pool) == []
+        assert doubtful_pairs(PHOTOS, unlike(), known, listed, [], pool) == []
     assert known.key() != KnownPairs().key()
 
 

@@ -341,14 +341,17 @@ def _own_cache(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.Mon
     monkeypatch.setattr("arview.guideviews.cache.cache_folder", lambda: folder)
 
 
-FEW = CadOptions(subdivisions=2, first_detections=3)
-"""Fewer guide views and tries than usual, for time."""
+@pytest.fixture(autouse=True)
+def _few_views_and_tries(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fewer guide views and tries than usual, for time."""
+    monkeypatch.setattr("arview.reconstruction.scale.cad.SUBDIVISIONS", 2)
+    monkeypatch.setattr("arview.reconstruction.scale.cad.FIRST_DETECTIONS", 3)
 
 
 def find(
     sparse: SparseModel, part: Part, sources: ScaleSources | None = None, *, pictures: list[NDArray[np.uint8]]
 ) -> ScaleResult:
-    return find_scale(sparse, part, sources, FEW, reader(pictures))
+    return find_scale(sparse, part, sources, CadOptions(), reader(pictures))
 
 
 def part_of(model: Model, base: str) -> Part:

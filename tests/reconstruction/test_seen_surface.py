@@ -9,7 +9,7 @@ from arview.cad.model import Model, make_model
 from arview.camera import Camera
 from arview.errors import InputError
 from arview.geometry import look_at
-from arview.reconstruction.seen_surface import seen_surface
+from arview.reconstruction.seen_surface import PIECES_ACROSS, seen_surface
 from helpers.cad_files import box
 from helpers.synthetic import component
 
@@ -37,7 +37,7 @@ def test_pieces_are_the_whole_surface() -> None:
     surface = seen_surface(part(), [(CAMERA, from_side(0.0))])
     assert surface.areas.sum() == pytest.approx(2 * 200 * 200 + 4 * 200 * 8 + 2 * (6 * 200 + 200 * 60 + 6 * 60))
     edges = np.linalg.norm(surface.corners - np.roll(surface.corners, -1, axis=1), axis=2)
-    assert edges.max() <= part().diameter_mm / SeenOptions().pieces_across + 1e-9
+    assert edges.max() <= part().diameter_mm / PIECES_ACROSS + 1e-9
 
 
 def test_one_side_leaves_the_other_unseen() -> None:

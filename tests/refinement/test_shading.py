@@ -26,6 +26,7 @@ from arview.refinement.modalities.shading import (
     curved_share,
     refine_by_shading,
 )
+from arview.refinement.view_model import MIN_CURVED_SHARE
 from arview.rendering.rasterizer import rasterise
 from helpers.synthetic import CAMERA, assembly
 
@@ -173,7 +174,7 @@ def test_only_parts_with_curved_surfaces_use_shading() -> None:
     assert curved_share(surface_of(_of(trimesh.creation.box((40.0, 30.0, 20.0))))) == 0.0
     assert curved_share(surface_of(blob())) > 0.95
     assert curved_share(surface_of(_of(trimesh.creation.cylinder(20.0, 80.0, sections=64)))) > 0.5
-    assert curved_share(surface_of(assembly())) < OPTIONS.min_curved_share
+    assert curved_share(surface_of(assembly())) < MIN_CURVED_SHARE
 
 
 def test_flat_faces_move_no_pose() -> None:

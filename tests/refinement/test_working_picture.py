@@ -11,7 +11,14 @@ import pytest
 from arview.camera import Camera
 from arview.geometry import Array, exp_so3, rigid
 from arview.refinement.modalities.texture import TextureMatches
-from arview.refinement.working_picture import WorkingScaleOptions, matches_in, window_around, working_picture
+from arview.refinement.working_picture import (
+    MAX_FINE_SPREAD_PX,
+    SOFT_RADIUS_PX,
+    WorkingScaleOptions,
+    matches_in,
+    window_around,
+    working_picture,
+)
 
 CAMERA = Camera(640, 480, 600.0, 610.0, 322.0, 236.0, np.array([0.05, -0.02, 0.001, -0.0005, 0.0]))
 OPTIONS = WorkingScaleOptions()
@@ -34,10 +41,10 @@ def test_a_small_part_is_judged_as_it_is_and_enlarged_at_most_four_times() -> No
 def test_a_soft_picture_has_no_pictures_finer_than_its_edges() -> None:
     sharp, soft, very_soft = (OPTIONS.scales(300.0, spread_px)[-1] for spread_px in (0.5, 4.0, 9.0))
     assert sharp > 1.0 > soft > very_soft
-    assert 4.0 * soft <= 1.2 * OPTIONS.max_fine_spread_px
+    assert 4.0 * soft <= 1.2 * MAX_FINE_SPREAD_PX
     scales = OPTIONS.scales(110.0, 8.0)
     assert len(scales) == 1
-    assert scales[0] * 110.0 >= 0.8 * OPTIONS.soft_radius_px
+    assert scales[0] * 110.0 >= 0.8 * SOFT_RADIUS_PX
 
 
 @pytest.mark.parametrize("scale", [2.0**-2.5, 0.25, 0.5, 2.0**-0.5, 1.0, 2.0**0.5, 2.0, 4.0])

@@ -31,8 +31,9 @@ from arview.measurement.folder import MetricReconstruction
 from arview.reconstruction.scale.types import Consistency, ScaleResult
 from arview.reconstruction.types import DenseCloud, PosedPhoto, SparseModel
 from arview.rendering.rasterizer import rasterise
-from arview.report import gather, make_report
+from arview.report import gather, make_report, pictures
 from arview.report import make as make_module
+from arview.report import scene as scene_module
 from arview.report.formatting import finding_text, number, zone_text
 from arview.report.pictures import make_gallery, overview
 from arview.report.scene import make_scene, scene_json
@@ -128,10 +129,11 @@ def test_undetermined_is_a_word_and_minus_a_minus() -> None:
 
 @pytest.mark.slow
 def test_crops_show_the_ghost_at_the_design_place_and_the_arrow_where_it_points(
-    model: Model, found: Inspection, reconstruction: MetricReconstruction
+    model: Model, found: Inspection, reconstruction: MetricReconstruction, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(pictures, "WIDTH_PX", 480)
+    monkeypatch.setattr(pictures, "HEIGHT_PX", 360)
     sparse = in_datum_frame(reconstruction)
-    options = CropOptions(width_px=480, height_px=360)
     gallery = make_gallery(found, model, sparse)
     assert not gallery.unread
     assert {name: len(crops) for name, crops in gallery.components.items()} == {
@@ -159,12 +161,13 @@ def test_crops_show_the_ghost_at_the_design_place_and_the_arrow_where_it_points(
 
 @pytest.mark.slow
 def test_the_ghost_lies_on_the_block_in_the_photo(
-    model: Model, found: Inspection, reconstruction: MetricReconstruction
+    model: Model, found: Inspection, reconstruction: MetricReconstruction, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Against the silhouette of the nominal block as the camera of the photo projects it."""
     sparse = in_datum_frame(reconstruction)
     plain = replace(found, components=(replace(found.components[0]),), foreign_objects=())
-    options = CropOptions(width_px=640, height_px=480, share=0.01, min_px=640)  # the whole photo
+    for name, value in {"WIDTH_PX": 640, "HEIGHT_PX": 480, "SHARE": 0.01, "MIN_PX": 640}.items():  # the whole photo
+        monkeypatch.setattr(pictures, name, value)
     crop = make_gallery(plain, model, sparse).components["block_1"][0]
     photo = next(one for one in sparse.photos if one.name == crop.photo)
     from arview.reconstruction.intake.reading import read_photo
@@ -278,12 +281,13 @@ def test_another_part_is_refused(source: Path, tmp_path: Path, part: Part) -> No
 
 @pytest.mark.slow
 def test_the_scene_is_the_cad_and_the_cloud(
-    model: Model, found: Inspection, reconstruction: MetricReconstruction
+    model: Model, found: Inspection, reconstruction: MetricReconstruction, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     cloud = reconstruction.cloud
     assert cloud is not None
     moved = replace(cloud, points=apply(invert(ROUGH_FROM_DATUM), cloud.points))
-    scene = make_scene(found, model, moved, None, SceneOptions(max_points=5000))
+    monkeypatch.setattr(scene_module, "MAX_POINTS", 5000)
+    scene = make_scene(found, model, moved, None)
     assert scene is not None
     again = json.loads(scene_json(scene))
     vertices = _decoded(again["mesh"])
@@ -304,7 +308,8 @@ def test_the_scene_is_the_cad_and_the_cloud(
     assert by_name["block_3"]["displacement"] == [0.1, 0.05, None]
     assert by_name["bench"]["verdict"] is None
     assert make_scene(found, None, None, None) is None
-    assert "mesh" not in (make_scene(found, model, moved, None, SceneOptions(max_faces=10)) or {})
+    monkeypatch.setattr(scene_module, "MAX_FACES", 10)
+    assert "mesh" not in (make_scene(found, model, moved, None) or {})
 
 
 def _decoded(pack: dict[str, Any]) -> Array:

@@ -16,8 +16,10 @@ from arview.geometry import Array, apply, rotation_angle_rad
 from arview.guideviews import GuideViewOptions, GuideViewSet, make_guide_views
 from arview.pose import TrackingState
 from arview.refinement.evidence import PoseEvidence
-from arview.tracking import Estimate, SessionOptions, TrackingSession
-from arview.tracking.appearance_memory import AppearanceMemory
+from arview.tracking import Estimate, SessionOptions, TrackingSession, appearance_memory, search_plan
+from arview.tracking import session as session_module
+from arview.tracking.appearance_memory import MAX_VIEWS, AppearanceMemory
+from arview.tracking.search.ncc_search import MAX_RESULTS
 from arview.tracking.search.view_crops import CROP_PX, ViewCropper
 from helpers.synthetic import CAMERA, RANGE, assembly, assembly_views, bracket, error, path, picture, pose_from
 
@@ -28,9 +30,9 @@ def estimate(pose: Array, quality: float = 1.0, support: float = 0.9, in_picture
     return Estimate(pose, np.eye(6), quality, PoseEvidence(support, 0.9, 0.3, 0.9, 0.9, 0.3, in_picture))
 
 
-def taught(sides: list[tuple[int, int]], **options: int) -> AppearanceMemory:
+def taught(sides: list[tuple[int, int]]) -> AppearanceMemory:
     """Memory of the assembly from some sides, each tracked for some frames."""
-    memory = AppearanceMemory(assembly_views(), CAMERA, AppearanceMemoryOptions(**options))
+    memory = AppearanceMemory(assembly_views(), CAMERA)
     for azimuth, elevation in sides:
         pose = pose_from(azimuth, elevation, 520)
         image = picture(pose, seed=100 + azimuth + elevation, scene=1)
@@ -70,7 +72,7 @@ def test_kept_sides_are_found_anywhere_in_other_scenes_and_light() -> None:
         truth = moved(*SIDES[k % len(SIDES)], rng)
         image = picture(truth, seed=k, scene=k % 9, noise=6.0, gain=rng.uniform(0.7, 1.3))
         proposals = memory.propose(image)
-        assert len(proposals) <= memory.options.search.max_results
+        assert len(proposals) <= MAX_RESULTS
         right += any(is_near(p.cam_from_model, truth) for p in proposals)
     assert right >= 16
 
@@ -82,7 +84,7 @@ def test_a_search_near_the_last_pose_is_fast() -> None:
         for elevation in (20, 42, 65):
             pose = pose_from(azimuth, elevation, 520)
             memory.add(picture(pose, scene=1), pose, is_new=True)
-    assert len(memory) == memory.options.max_views
+    assert len(memory) == MAX_VIEWS
     right, seconds = 0, []
     for k in range(12):
         last = pose_from(*SIDES[k % len(SIDES)], 520)
@@ -103,8 +105,10 @@ def test_a_search_near_the_last_pose_is_fast() -> None:
     assert np.median(seconds) < 0.1  # about 25 ms on a quiet core
 
 
-def test_memory_is_bounded_and_views_close_together_are_dropped() -> None:
-    memory = taught([*SIDES, (-40, 33), (37, 30)], max_views=4, view_step_deg=2)
+def test_memory_is_bounded_and_views_close_together_are_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(appearance_memory, "MAX_VIEWS", 4)
+    monkeypatch.setattr(appearance_memory, "VIEW_STEP_DEG", 2)
+    memory = taught([*SIDES, (-40, 33), (37, 30)])
     assert len(memory) == 4
     directions = memory.rotations[:, 2]
     cosines = directions @ directions.T - 2 * np.eye(4)
@@ -152,10 +156,18 @@ def test_the_silhouette_is_that_of_the_part() -> None:
     assert cropper.crop(picture(None, scene=2), far) is None
 
 
+@pytest.fixture
+def no_search(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The detector never searches the whole picture."""
+    for module in (search_plan, session_module):
+        monkeypatch.setattr(module, "EAGER_FRAMES", 0)
+    monkeypatch.setattr(search_plan, "SEARCH_EVERY", 10_000)
+
+
 @pytest.mark.slow
+@pytest.mark.usefixtures("no_search")
 def test_no_pose_is_accepted_without_the_part() -> None:
-    options = SessionOptions(eager_frames=0, search_every=1000)
-    session = TrackingSession(assembly_views(), CAMERA, assembly(), options)
+    session = TrackingSession(assembly_views(), CAMERA, assembly())
     session.appearance_memory = six_sides()
     session._state.state = TrackingState.LOST
     for k in range(12):
@@ -169,11 +181,11 @@ def test_no_pose_is_accepted_without_the_part() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("no_search")
 def test_a_lost_part_is_found_by_its_appearance() -> None:
     found = {}
     for use_appearance_memory in (True, False):
-        # The detector never searches the whole picture.
-        options = SessionOptions(eager_frames=0, search_every=10_000, use_appearance_memory=use_appearance_memory)
+        options = SessionOptions(use_appearance_memory=use_appearance_memory)
         session = TrackingSession(assembly_views(), CAMERA, assembly(), options, initial_cam_from_model=path(1)[0])
         for k, pose in enumerate(path(20)):
             tracked = session.process(picture(pose, seed=k, scene=1), k, k / 30)
@@ -188,7 +200,7 @@ def test_a_lost_part_is_found_by_its_appearance() -> None:
     assert found == {True: True, False: False}
 
 
-def test_views_are_saved_and_loaded(tmp_path: Path) -> None:
+def test_views_are_saved_and_loaded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     memory, file = six_sides(), tmp_path / "assembly.learned"
     memory.save(file)
     assert [p.name for p in tmp_path.iterdir()] == [file.name]
@@ -198,7 +210,8 @@ def test_views_are_saved_and_loaded(tmp_path: Path) -> None:
     image = picture(pose_from(2, 32, 500), scene=3)
     mine, theirs = memory.propose(image), other.propose(image)
     assert mine and np.allclose(mine[0].cam_from_model, theirs[0].cam_from_model)
-    small = AppearanceMemory(assembly_views(), CAMERA, AppearanceMemoryOptions(max_views=3))
+    monkeypatch.setattr(appearance_memory, "MAX_VIEWS", 3)
+    small = AppearanceMemory(assembly_views(), CAMERA)
     small.load(file)
     assert len(small) == 3
 
@@ -240,10 +253,3 @@ def test_members_whose_headers_lie_are_refused(tmp_path: Path, member: str, head
             archive.writestr(name, content)
     with pytest.raises(InputError, match=r"views\.learned.*damaged.*delete the file"):
         AppearanceMemory(assembly_views(), CAMERA).load(file)
-
-
-def test_invalid_options_are_refused() -> None:
-    with pytest.raises(InputError, match="max_views"):
-        AppearanceMemoryOptions(max_views=0)
-    with pytest.raises(InputError, match="stretch"):
-        NccSearchOptions(stretch=1.0)

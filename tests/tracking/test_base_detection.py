@@ -12,7 +12,7 @@ from arview.geometry import Array, apply
 from arview.pose import Presence
 from arview.refinement.view_model import PartView
 from arview.tracking import TrackingSession
-from arview.tracking.base_detection import BaseDetection
+from arview.tracking.base_detection import MIN_QUALITY, WHOLE_FRAMES, BaseDetection
 from helpers.synthetic import CAMERA, assembly, assembly_views, block, changed, picture, pose_from
 
 NAMES = tuple(one.name for one in assembly().components)
@@ -33,7 +33,7 @@ def test_a_bare_base_is_found() -> None:
     for k in range(3):
         pose = pose_from(-40 + 40 * k, 40, 520)
         (found,) = detection.detect(picture(pose, BARE, seed=k, scene=k, noise=3.0), [0])
-        assert found.quality >= detection.options.min_quality
+        assert found.quality >= MIN_QUALITY
         assert is_right(found.cam_from_model, pose)
 
 
@@ -90,9 +90,8 @@ def test_the_whole_part_is_found_where_another_thing_was_taken_for_its_base() ->
         detection = BaseDetection(assembly_views(), CAMERA, assembly())
         monitor.is_placed = False
         assert monitor.rests_on_base
-        frames = detection.options.whole_frames
-        found = [detection.find_whole(image, detector, monitor, start, 0.8) for _ in range(frames)]
-        assert found[:-1] == [None] * (frames - 1), "a search in every frame would be too slow"
+        found = [detection.find_whole(image, detector, monitor, start, 0.8) for _ in range(WHOLE_FRAMES)]
+        assert found[:-1] == [None] * (WHOLE_FRAMES - 1), "a search in every frame would be too slow"
         if is_moved:
             assert found[-1] is not None and np.allclose(found[-1].cam_from_model, truth, atol=3.0)
             assert monitor.rests_on_base
@@ -106,6 +105,5 @@ def test_a_bare_base_is_not_left_for_the_whole_part() -> None:
     monitor, detector = AssemblyMonitor(assembly_views(), CAMERA, assembly()), Detector(assembly_views(), CAMERA)
     detection, truth = BaseDetection(assembly_views(), CAMERA, assembly()), pose_from(20, 40, 520)
     image = picture(truth, BARE, seed=3, scene=1, noise=3.0)
-    searches = 6 * detection.options.whole_frames
-    found = [detection.find_whole(image, detector, monitor, truth, 0.8) for _ in range(searches)]
+    found = [detection.find_whole(image, detector, monitor, truth, 0.8) for _ in range(6 * WHOLE_FRAMES)]
     assert all(one is None or detection.is_same(monitor, one.cam_from_model, truth) for one in found)

@@ -19,7 +19,7 @@ from arview.geometry import Array, apply, exp_se3, rigid
 from arview.guideviews import GuideViewOptions, make_guide_views
 from arview.overlay import OverlayOptions, OverlayRenderer
 from arview.pose import Pose, TrackingState
-from arview.tracking import SessionOptions, TrackingSession
+from arview.tracking import TrackingSession
 from arview.tracking.guide_pose import guide_names, guide_pose
 from arview.tracking.guided_init import GuidedInit
 from arview.tracking.session import ALIGN
@@ -273,9 +273,9 @@ def test_the_session_waits_for_the_part_and_tracks_it() -> None:
 
 
 @pytest.mark.slow
-def test_the_outline_comes_back_when_a_lost_part_is_not_found_for_long() -> None:
-    options = SessionOptions(align_again_frames=4)
-    session = TrackingSession(assembly_views(), CAMERA, assembly(), options, guide_cam_from_model=GUIDE)
+def test_the_outline_comes_back_when_a_lost_part_is_not_found_for_long(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("arview.tracking.session.ALIGN_AGAIN_FRAMES", 4)
+    session = TrackingSession(assembly_views(), CAMERA, assembly(), guide_cam_from_model=GUIDE)
     for k in range(4):
         result = session.process(picture(GUIDE, seed=k, scene=3), k, 0.0)
     assert result.state == TrackingState.TRACKED

@@ -323,8 +323,9 @@ def test_what_is_known_goes_over_to_the_session_of_another_camera() -> None:
     assert third.update(image, estimate(pose), 50, 2.0, finders).identity is Identity.CONFIRMED
 
 
-def test_without_the_monitoring_every_pose_is_followed() -> None:
-    monitor = IdentityMonitor(assembly_views(), CAMERA, IdentityOptions(is_used=False))
+def test_without_the_monitoring_every_pose_is_followed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("arview.tracking.identity.monitor.IS_USED", False)
+    monitor = IdentityMonitor(assembly_views(), CAMERA)
     for i, specimen_pose in enumerate((LEFT, RIGHT, LEFT)):
         image, pose = turned(0.0, i, specimen_pose)
         assert monitor.update(image, estimate(pose), i, i / 30.0, FakeFinders()).identity is Identity.FOLLOWED

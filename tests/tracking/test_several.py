@@ -16,7 +16,7 @@ from arview.guideviews import GuideViewSet
 from arview.guideviews.cache import cached_guide_views
 from arview.pose import Pose, TrackingState
 from arview.tracking import TrackingSession
-from arview.tracking.search_plan import SearchPlan
+from arview.tracking.search_plan import SEARCH_EVERY, SearchPlan
 from arview.tracking.session_state import SessionState
 from arview.tracking.several.sessions import SeveralSessions
 from arview.tracking.several.specimens import hide_specimens, is_same_specimen, searched_picture
@@ -121,7 +121,7 @@ def test_another_part_that_is_tracked_is_hidden_from_the_first_round_of_searches
     # A part may stand on another: in the next round nothing is hidden.
     plan = SearchPlan(others, camera)
     assert plan.hides_parts(SessionState(frames_without_pose=1))
-    assert not plan.hides_parts(SessionState(frames_without_pose=2 * second.options.search_every))
+    assert not plan.hides_parts(SessionState(frames_without_pose=2 * SEARCH_EVERY))
     assert searched_picture(image, (), second.covers, others, camera) is not image
     assert searched_picture(image, (), (), others, camera) is image
     # Nor is a place hidden at which the other part is not sure.

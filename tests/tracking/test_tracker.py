@@ -17,7 +17,7 @@ from arview.guideviews import GuideViewOptions, make_guide_views
 from arview.pose import Pose, TrackingState
 from arview.refinement.modalities.edge import smoothed
 from arview.refinement.schedules import TRACK_STAGES
-from arview.tracking import Estimate, SessionOptions, Tracker, TrackerOptions, TrackingSession
+from arview.tracking import Estimate, Tracker, TrackerOptions, TrackingSession
 from arview.tracking.search.wide_search import WideSearch
 from helpers.synthetic import (
     CAMERA,
@@ -358,8 +358,6 @@ def test_guide_views_of_another_model_are_refused() -> None:
         TrackingSession(make_guide_views(bracket(), ViewRange((400.0, 700.0)), coarse), CAMERA, assembly())
 
 
-def test_invalid_options_and_poses_are_refused() -> None:
-    with pytest.raises(InputError, match="lost_quality"):
-        SessionOptions(lost_quality=0.9)
+def test_invalid_poses_are_refused() -> None:
     with pytest.raises(InputError, match="initial pose"):
         TrackingSession(assembly_views(), CAMERA, assembly(), initial_cam_from_model=2.0 * np.eye(4))

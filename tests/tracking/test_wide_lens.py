@@ -83,9 +83,10 @@ def test_detector_takes_pictures_of_a_wide_lens() -> None:
 
 
 @pytest.mark.parametrize("camera", [FISHEYE, RATIONAL], ids=["fisheye", "rational"])
-def test_edges_are_drawn_where_the_lens_shows_them(camera: Camera) -> None:
+def test_edges_are_drawn_where_the_lens_shows_them(camera: Camera, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("arview.overlay.renderer.SHOW_ARROWS", False)
     pose = poses(1)[0]
-    options = OverlayOptions(show_ghost=False, show_labels=False, show_arrows=False, show_status=False)
+    options = OverlayOptions(show_ghost=False, show_labels=False, show_status=False)
     grey = np.full((camera.height, camera.width, 3), 118, dtype=np.uint8)
     present = ComponentPresence(Presence.PRESENT, Visibility.VISIBLE, 0.99, 9, 40.0)
     components = {one.name: present for one in assembly().components}

@@ -16,13 +16,14 @@ from arview.cad.model import Model, make_model
 from arview.cli import main
 from arview.errors import CannotMeasureError, InputError
 from arview.geometry import Array, rigid, rotation_angle_rad
+from arview.measurement.photo import edges, sweep
 from arview.reconstruction.dense import DenseOptions
 from arview.reconstruction.features import FeatureOptions
 from arview.reconstruction.run import Reconstruction, ReconstructOptions, reconstruct
 from arview.reconstruction.sparse import SparseOptions
 from arview.workflow.job import InspectJob
 from arview.workflow.prepare import measurement_key, prepare
-from arview.workflow.silhouettes import CadSilhouettes, SilhouetteOptions, silhouette_mask
+from arview.workflow.silhouettes import MARGIN_MM, CadSilhouettes, SilhouetteOptions, silhouette_mask
 from helpers.cad_files import obj_text, write_bench
 from helpers.photo_scene import CAMERA, Picture, bench, photograph, ring, write_photos
 
@@ -99,8 +100,8 @@ def off_part_mm(found: Reconstruction) -> np.ndarray:
 
 
 def test_the_margin_covers_what_is_searched() -> None:
-    searched = max(SweepOptions().capture_mm, EdgeOptions().capture_mm, DenseOptions().band_mm)
-    assert SilhouetteOptions().margin_mm >= 2.0 * searched
+    searched = max(sweep.CAPTURE_MM, edges.CAPTURE_MM, DenseOptions().band_mm)
+    assert 2.0 * searched <= MARGIN_MM
 
 
 @pytest.mark.parametrize("pose", POSES[:4])
@@ -109,7 +110,7 @@ def test_displaced_components_are_inside(pose: Array, move: tuple[float, float, 
     # The plate's corner, the farthest outward of all, is displaced with the blocks.
     moves = {one.name: rigid(np.eye(3), np.array(move)) for one in part_model().components}
     seen = part_pixels(pose, moves)
-    mask = silhouette_mask(part_model(), pose, CAMERA, SilhouetteOptions().margin_mm)
+    mask = silhouette_mask(part_model(), pose, CAMERA, MARGIN_MM)
     assert seen.sum() > 50_000 and mask.shape == seen.shape
     assert not (seen & ~mask).any()
 

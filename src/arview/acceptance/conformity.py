@@ -24,10 +24,11 @@ COVERAGE = 0.9545
 MAX_DRAWS = 1000
 """Simulated tests for the range of the number of errors within U."""
 MIN_DRAWS = 200
+"""Fewest simulated tests, however many lengths there are."""
 MAX_VALUES = 500_000
 """Simulated errors in all, which bounds the draws for many lengths."""
 INTERVAL = 0.95
-"""Share of the tests that the range of this number holds."""
+"""Share of the simulated tests that the range of the number of errors within U holds."""
 QUANTILES = (0.025, 0.975)
 """Ends of that range in the simulation."""
 WIDE_RATIO = 0.5

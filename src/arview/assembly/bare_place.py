@@ -31,7 +31,7 @@ MAX_DEVIATIONS = 3.0
 NOISE = 3.0
 """Smallest standard deviation in grey levels."""
 SHADING = 0.04
-"""The same as a share of the brightness."""
+"""Share of the brightness that is added to ``NOISE``."""
 MAX_NOISE = 16.0
 """Largest standard deviation; on a base with more texture few pixels match."""
 MAX_SMOOTHER = 2.0

@@ -18,9 +18,9 @@ MAX_DIRECTIONS = 64
 REPEAT_DECAY = 0.35
 """The n-th observation adds this to the power of n - 1 to the weight of their mean."""
 REPEAT_FLOOR = 0.03
-"""Every observation after the first `REPEATS_WITHOUT_FLOOR` adds this as well."""
+"""Every observation after the first ``REPEATS_WITHOUT_FLOOR`` adds this to the weight of their mean as well."""
 REPEATS_WITHOUT_FLOOR = 4
-"""See there."""
+"""Observations from one direction to whose weight nothing but the decaying share is added."""
 CLEARING_WEIGHT = 0.5
 """Weight of a direction's evidence for a component that is called mismatched. A displaced component looks right from
 directions along its displacement."""

@@ -66,17 +66,17 @@ class PointLimits(NamedTuple):
 DISPLACED_MM = 2.5
 """Largest deviation from the nominal placement that is allowed."""
 DISPLACED_SHARE = 0.02
-"""The same in diameters of the part; the smaller one holds."""
+"""Largest deviation that is allowed, in diameters of the part; the smaller of it and ``DISPLACED_MM`` holds."""
 POSE_PX = 1.0
-"""Error of the pose, which is added to it."""
+"""Error of the pose, which is added to the largest allowed deviation."""
 SHIFT_COST = 0.2
 """Share of points by which the support must grow at the largest allowed shift."""
 SEARCHED_MM = 24.0
 """Largest shift that is tried."""
 SEARCHED_SHARE = 0.15
-"""The same in diameters of the part."""
+"""Largest shift that is tried, in diameters of the part."""
 SEARCHED_PX = 44.0
-"""The same in the picture; the smallest of the three holds."""
+"""Largest shift that is tried in the picture; the smallest of the three limits holds."""
 SEARCH_GAP_PX = 2.0
 """Gap between allowed and larger shifts."""
 MIN_SEARCH_PX = 6.0

@@ -68,14 +68,14 @@ differs between frames."""
 INCOMPLETE_QUALITY = 0.85
 """Poses of lower quality are observed at once while components are suspect."""
 URGENT_FRAMES = 2
-"""Frames between these observations."""
+"""Frames between observations of a pose of low quality while components are suspect."""
 SUSPECT_FRAMES = 6
 """Frames between observations while a component is suspect, or while an open one becomes visible."""
 OPEN_FRAMES = 15
 """Frames between observations while a component is open, or visible but not yet verified."""
 REST_FRAMES = 45
-"""Frames between observations while all components are as expected. All three are for new directions; from a known
-direction the next longer interval is used."""
+"""Frames between observations while all components are as expected. This interval, ``OPEN_FRAMES`` and
+``SUSPECT_FRAMES`` are for new directions; from a known direction the next longer one is used."""
 FRESH_OBSERVATIONS = 6
 """Observations from a direction before it counts as known while a component is suspect, because the first ones may have
 been blurred."""

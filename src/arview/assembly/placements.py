@@ -19,7 +19,7 @@ from arview.geometry import Array
 MAX_SAMPLES = 4000
 """Samples of a component's surface."""
 SPACING_SHARE = 0.01
-"""Their distance, in diameters of the part."""
+"""Distance between samples of a component's surface, in diameters of the part."""
 TOUCH_SHARE = 0.004
 """Distance, in diameters of the part, below which surfaces touch."""
 MIN_TOUCHING = 0.01
@@ -30,15 +30,15 @@ bases that can be swapped."""
 REACH_MM = 30.0
 """Largest distance of an alternative placement."""
 REACH_SHARE = 0.15
-"""The same in diameters of the part; the smaller one holds."""
+"""Largest distance of an alternative placement in diameters of the part; the smaller of it and ``REACH_MM`` holds."""
 STEPS = 4
-"""Grid steps up to that distance."""
+"""Grid steps up to the largest distance of an alternative placement."""
 MIN_STEPS = 0.9
 """Nearer placements, in steps, cannot be distinguished from the nominal one."""
 OVERHANG_STEPS = 0.6
 """Grid steps by which a component may extend beyond its base."""
 CLEAR_SHARE = 0.002
-"""Distance, in diameters of the part, by which it may overlap others."""
+"""Distance, in diameters of the part, by which an alternative placement may overlap other components."""
 
 
 class Swap(NamedTuple):

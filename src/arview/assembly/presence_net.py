@@ -45,7 +45,7 @@ MIN_PIXELS = 40
 MIN_SOURCE_PX = 10
 """Smallest side of the cut-out piece of the picture."""
 MAX_SOURCE_SHARE = 1.6
-"""Largest side of it, as a multiple of the picture's larger side."""
+"""Largest side of the cut-out piece, as a multiple of the picture's larger side."""
 NEAR_SHARE = 0.1
 """Components nearer to the camera than this share of the part's diameter are left out."""
 DEPTH_JUMP = 0.03

@@ -25,10 +25,10 @@ MAX_SAMPLES = 3000
 SAME_SHARE = 0.015
 """Distance in diameters of the base up to which a turned sample lies on its surface."""
 MIN_SAME = 0.9
-"""Share of the samples that must."""
+"""Share of the samples of the base that must lie on its surface when it is turned."""
 ROUGH_STEP = 12
 ROUGH_MARGIN = 0.15
-"""Every so many-th sample is tried first, and by how much fewer of these may lie there."""
+"""Every ``ROUGH_STEP``-th sample is tried first; this smaller a share of these may lie on the surface."""
 EXACT_SHARE = 0.003
 """Distance in diameters of the base up to which all its corners, turned, lie on corners if the symmetry is exact."""
 BASE_WEIGHT = 30.0
@@ -40,7 +40,7 @@ AS_BEFORE = 6.0
 BETTER = 5.5
 """Summed log odds from which on a turned pose is better."""
 WORSE = -3.5
-"""Summed log odds below which it is none."""
+"""Summed log odds below which a turned pose is ruled out."""
 
 
 class TurnEvidence(NamedTuple):

@@ -25,7 +25,7 @@ RADIUS_SHARE = 0.05
 PLACE_SHARE = 0.25
 """Largest distance of the declared point from the axis, of the radius."""
 PLACE_MM = 0.2
-"""Largest distance of the declared point from a plane, and a share that is added to the others."""
+"""Largest distance of the declared point from a plane, which is also added to ``PLACE_SHARE`` of the radius."""
 
 
 @dataclass(frozen=True)

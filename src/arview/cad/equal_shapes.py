@@ -17,7 +17,7 @@ _SAME_SHARE = 1e-4
 MAX_FACES = 150_000
 """Triangles of all shapes that are searched, in the order of the part; it takes a second for some thousands of them."""
 MAX_SHAPES = 120
-"""Shapes that are searched."""
+"""Shapes of a part that are searched for symmetries, in the order of the part."""
 
 
 class ShapeSymmetries:

@@ -8,7 +8,7 @@ from arview.cad.part import ComponentSettings, Part
 MAX_EXTENT_SHARE = 1.0
 """A tolerance of position above this share of the component's largest extent is doubted."""
 MAX_ANGLE_DEG = 45.0
-"""A tolerance of rotation above it is doubted."""
+"""A tolerance of rotation above this angle is doubted."""
 EXPECTED_U_PX = 0.12
 """Expanded uncertainty (k = 2) of a place that two dozen photos of a sharp camera reach, px of a photo from the nearest
 declared distance."""

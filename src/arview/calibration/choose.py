@@ -23,9 +23,9 @@ from arview.geometry import Array
 MAX_ERROR_RATIO = 2.0
 """Largest expected error (blur, motion) of a view, relative to the median."""
 MIN_SEPARATION = 0.02
-"""Of the diagonal; of views nearer to each other the better one is kept."""
+"""Share of the picture's diagonal; of views nearer to each other the better one is kept."""
 INITIAL_VIEWS = 25
-"""For the first camera, with which the information of all views is computed."""
+"""Views for the first camera, with which the information of all views is computed."""
 
 
 @dataclass(frozen=True)

@@ -19,11 +19,11 @@ from arview.geometry import Array, exp_so3
 START_HALF_ANGLES_DEG: tuple[float, ...] = (30.0, 45.0, 60.0, 75.0, 90.0, 105.0)
 """Angles off the axis, at the border of the picture's longer side, that are tried."""
 CANDIDATES = 2
-"""Starts that are adjusted, those that fit best."""
+"""Starts that are adjusted: those that fit best."""
 MAX_STEPS = 60
 """Steps of the adjustment."""
 TOLERANCE = 1e-10
-"""Relative change of the sum of squares below which it has ended."""
+"""Relative change of the sum of squares below which the adjustment has ended."""
 
 
 def adjust_fisheye(views: Sequence[BoardView], width: int, height: int, start: Camera | None) -> tuple[Camera, Array]:

@@ -13,12 +13,12 @@ from arview.calibration.views import BoardView
 from arview.errors import InputError
 
 PERCENTILE = 90.0
-"""Of the residuals' lengths that is compared: high, because a wrong model shows at the rim of the picture, and below
-100, because single corners are wrong."""
+"""Percentile of the residuals' lengths that is compared: high, because a wrong model shows at the rim of the picture,
+and below 100, because single corners are wrong."""
 MIN_RESIDUAL_PX = 0.25
-"""Residuals below it are those of the corners, whatever the model."""
+"""Smaller residuals are those of the corners, whatever the model."""
 MIN_RATIO = 1.4
-"""Residuals of the model in use by those of the other one from which that is recommended."""
+"""Residuals of the model in use over those of the other one from which the other one is recommended."""
 
 
 @dataclass(frozen=True)

@@ -30,13 +30,13 @@ K = 2.0
 MIN_VIEWS = 5
 """With fewer, poses and nine intrinsics are hardly checked."""
 VIEW_OUTLIER = 2.5
-"""Times the median view's rms; a view above is blurred or bent."""
+"""Multiple of the median view's rms above which a view is blurred or bent."""
 VIEW_FLOOR_PX = 0.15
-"""Views that fit this well are kept, however well the others fit."""
+"""Views whose rms is below this are kept, however well the others fit."""
 CORNER_OUTLIER = 4.5
-"""Robust standard deviations; 1 in 25,000 normal errors is larger."""
+"""Robust standard deviations above which a corner is wrong; 1 in 25,000 normal errors is larger."""
 ROUNDS = 12
-"""Of solving and rejecting; wrong corners are removed a few at a time."""
+"""Rounds of solving and rejecting; wrong corners are removed a few at a time."""
 
 
 @dataclass(frozen=True)

@@ -20,25 +20,25 @@ class Grade(StrEnum):
 
 
 GOOD_FOCAL = 0.002
-"""Relative U of the focal length: 0.2 % of the distance, 1 mm at arm's length."""
+"""Relative U of the focal length of a good calibration: 0.2 % of the distance, 1 mm at arm's length."""
 USABLE_FOCAL = 0.01
-"""A guess from EXIF data is as good as more than this."""
+"""Relative U of the focal length up to which a calibration is usable; a guess from EXIF data is as good as more."""
 GOOD_PIXEL = 5e-4
-"""U of where a ray is seen, at the worst of 63 places: 1 px at 1080p."""
+"""U of where a ray is seen, at the worst of 63 places, as a share of the picture's diagonal: 1 px at 1080p."""
 USABLE_PIXEL = 3e-3
-"""Limit of usable for the same."""
+"""U of where a ray is seen, at the worst place, as a share of the diagonal, up to which a calibration is usable."""
 USABLE_RMS = 1e-3
-"""Residuals; above, the board is not flat, or is another one."""
+"""Residuals, as a share of the diagonal, of a usable calibration; above, the board is not flat, or is another one."""
 GOOD_COVERAGE = 0.7
-"""Share of the picture's cells with a corner of the board."""
+"""Share of the picture's cells with a corner of the board in a good calibration."""
 USABLE_COVERAGE = 0.4
-"""Limit of usable for the same."""
+"""Share of the picture's cells with a corner of the board from which a calibration is usable."""
 TILTED_DEG = 20.0
 """Views tilted by more than this determine the focal length."""
 MIN_TILTED = 4
-"""Number of such views, to at least two sides."""
+"""Number of tilted views, to at least two sides."""
 GOOD_RANGE = 1.3
-"""Distance of the farthest over the nearest board."""
+"""Distance of the farthest board over that of the nearest in a good calibration."""
 
 
 @dataclass(frozen=True)

@@ -54,9 +54,9 @@ NEARBY_ALONG = 0.25
 
 
 GLOBAL_SEARCH = GlobalSearchOptions()
-"""Of the search for rough poses; its radius, roll step and subdivisions are those above."""
+"""Options of the search for rough poses; its radius, roll step and subdivisions are those of `DetectorOptions`."""
 LOCAL = LocalSearchOptions()
-"""Of the search around rough poses; its radius is that above."""
+"""Options of the search around rough poses; its radius is that of `DetectorOptions`."""
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,8 @@ MIN_PART_SHARE = 0.2
 """Changed area from which the scene has changed, as a share of the square of the part's diameter in the picture at its
 farthest distance; the part itself covers up to half of that square."""
 MAX_SHARE = 0.05
-"""The same as a share of the picture, for parts that are large at all distances."""
+"""Changed area from which the scene has changed, as a share of the picture, for parts that are large at all
+distances."""
 MAX_GAIN = 2.0
 """Largest factor by which exposure or white balance may have changed."""
 

@@ -92,13 +92,13 @@ class SerialNumbers:
 EVERY = 15
 """Frames between two attempts until a code has been read."""
 AGAIN_EVERY = 60
-"""Frames between two attempts afterwards."""
+"""Frames between two attempts after a code has been read."""
 MAX_SIDE_PX = 900
 """Longer side of the cut-out of the part beyond which it is reduced; it bounds the time."""
 MIN_SIDE_PX = 600
 """Longer side below which it is enlarged, because modules of few pixels are not read."""
 MAX_ENLARGEMENT = 3.0
-"""Factor by which it is enlarged at most."""
+"""Factor by which the cut-out is enlarged at most."""
 MARGIN = 0.02
 """Border around the part's outline in which a code still belongs to it, in widths of its box."""
 

@@ -33,7 +33,7 @@ SAMPLE_RANGE = (8, 60)
 HALF_WIDTH_PX = 1.0
 THRESHOLD = 1.0
 HALF_SLOPE = 6.0
-"""Of the profiles, see `find_steps` and `choose_steps`."""
+"""Half width, weakest step and slope of half weight of the profiles, see `find_steps` and `choose_steps`."""
 MAX_DEVIATION_PX = 0.6
 """Samples farther than this from the median offset of their side are dropped."""
 MIN_SAMPLES = 6
@@ -80,7 +80,7 @@ def refined_quad(light: NDArray[np.float32], camera: Camera, quad: Array) -> Arr
     """Corners (4,2) px of a tag as intersections of its four sides, which are straight once distortion is removed.
 
     OpenCV's corner refinement is made for chessboards: at the isolated corner of a tag its result lies 0.1 to 0.3 px
-    inside. Where a side cannot be fitted, or a corner would move by more than ``reach_px``, ``quad`` is returned.
+    inside. Where a side cannot be fitted, or a corner would move by more than ``REACH_PX``, ``quad`` is returned.
 
     Args:
         light: (H,W) linear light, see `linear_light`.

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 
 SIGNIFICANT_DIGITS = 2
-"""Digits of U, and with it the last decimal of the value."""
+"""Digits of U, which set the last decimal of the value as well."""
 MAX_DECIMALS = 6
 """Largest number of decimals, for a very small U."""
 EXACT_DECIMALS = 4

@@ -19,7 +19,7 @@ from arview.measurement.photo.patches import near_others, symmetries_of, tangent
 CONTACT_MM = 0.3
 """Surfaces this near to another component stand on it; CAD leaves gaps for welds and glue."""
 SAMPLES = 4000
-"""On the surface of a component, where no whole face is in contact."""
+"""Samples on the surface of a component, where no whole face is in contact."""
 MIN_SAMPLES = 10
 """Samples that make a contact."""
 MIN_COHERENCE = 0.7

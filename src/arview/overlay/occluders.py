@@ -54,7 +54,7 @@ _MIN_AGREEING = 0.1
 
 
 CELLS = 72
-"""Of the grid along the longest side of the part."""
+"""Cells of the grid along the longest side of the part."""
 SAMPLES = 9000
 """Pixels that are compared in a frame, about."""
 MIN_OBSERVATIONS = 6
@@ -62,36 +62,36 @@ MIN_OBSERVATIONS = 6
 HUE_NOISE = 4.0
 """Standard deviation, in grey levels, of a colour of the same brightness, apart from what a cell shows."""
 NOISE = 8.0
-"""The same of the brightness."""
+"""Standard deviation, in grey levels, of the brightness of the same colour, apart from what a cell shows."""
 SHADE = 0.85
 SHINE = 1.25
 """Factors of the brightness between which shading, shadows and reflections explain a difference."""
 MAX_VARIANCE = 150.0
-"""Of hue and brightness in a cell, squared grey levels; more would make it blind."""
+"""Largest variance of hue and brightness in a cell, squared grey levels; more would make it blind."""
 MIN_SCORE = 1.0
 """Squared normalised difference of colours from which on a pixel looks like an occluder."""
 SURE_SCORE = 6.0
-"""The same of pixels of which every occluder must have some."""
+"""Squared normalised difference of colours that some pixels of every occluder must reach."""
 MIN_CONTRAST = 0.25
 """Standard deviation, among neighbours, of the logarithm of seen to expected brightness from which on there is an edge
 that the surface does not have."""
 MIN_SHARE = 0.6
-"""Share of neighbours that must look so, too."""
+"""Share of neighbours that must look like an occluder, too."""
 MIN_SAMPLES = 10
-"""Samples of an occluder, at least."""
+"""Samples that an occluder has at least."""
 MIN_SURE_SHARE = 0.15
-"""Share of them that must be sure."""
+"""Share of an occluder's samples that must be sure."""
 REACH = 6
 """Distance, in samples, up to which an occluder is extended to its outline."""
 MIN_MISMATCH = 2.5
 """Root mean square of the logarithm of seen to expected colour in a gap of an occluder, in standard deviations of the
 surface, from which on the gap belongs to it: the surface between two fingers agrees."""
 MIN_SURFACE_NOISE = 0.02
-"""The least such standard deviation."""
+"""Smallest standard deviation of a surface's logarithmic colour in ``MIN_MISMATCH``."""
 RATE = 0.04
 """Weight of a new colour in a cell that was seen often."""
 OCCLUDED_RATE = 0.002
-"""The same where an occluder was found: what stays is learned in the end."""
+"""Weight of a new colour where an occluder was found: what stays is learned in the end."""
 
 
 class OccluderFinder:

@@ -36,9 +36,9 @@ PANEL_RGB: Rgb = (16, 20, 27)
 
 
 UNIT: Unit = "mm"
-"""Of the numbers on labels."""
+"""Unit of the numbers on labels."""
 DECIMALS = 2
-"""Of the numbers on labels, 0–4."""
+"""Decimals of the numbers on labels, 0–4."""
 
 
 @dataclass(frozen=True)

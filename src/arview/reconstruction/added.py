@@ -48,11 +48,11 @@ Hidden = Callable[[int, NDArray[np.float32]], NDArray[np.bool_]]
 MIN_INLIERS = 25
 """Matched points that agree on a new photo's pose."""
 MAX_ERROR_PX = 4.0
-"""Of such a point."""
+"""Largest error of a point that agrees on a new photo's pose."""
 MIN_PLACED = 3
-"""New photos; a point needs two, and the third can contradict them."""
+"""New photos that must be placed; a point needs two, and the third can contradict them."""
 MAX_HINT_ANGLE_DEG = 45.0
-"""Between rough poses of a new and an earlier photo that are matched."""
+"""Largest angle between the rough poses of a new and an earlier photo that are matched."""
 
 
 @dataclass(frozen=True)

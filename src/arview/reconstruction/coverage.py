@@ -16,17 +16,17 @@ from arview.rendering.rasterizer import rasterise
 from arview.rendering.renderers import ZBufferRenderer
 
 MAX_SIDE_PX = 400
-"""Of the rendered pictures; a component of 1 % of the width still has 16 px."""
+"""Longer side of the rendered pictures; a component of 1 % of the width still has 16 px."""
 MIN_PX = 12
-"""Visible pixels at that size, below which nothing on a component can be matched."""
+"""Visible pixels at the rendered size below which nothing on a component can be matched."""
 MIN_SHARE = 0.3
 """Visible share of a component's own silhouette that counts as seen."""
 DIRECTION_DEG = 15.0
 """Views that differ by less count as one direction."""
 PHOTOS_WANTED = 4
-"""One more than the minimum that can contradict each other."""
+"""Photos of a component: one more than the minimum that can contradict each other."""
 DIRECTIONS_WANTED = 3
-"""Two determine a distance, the third confirms it."""
+"""Directions from which a component is seen: two determine a distance, the third confirms it."""
 ONE_SIDE_DEG = 40.0
 """If no two views of the part differ by more, depth is poorly known."""
 ALONE_DEG = 35.0
@@ -34,7 +34,7 @@ ALONE_DEG = 35.0
 GAP_DEG = 150.0
 """Azimuth range without photos that is reported."""
 TRIED_DIRECTIONS = 80
-"""About 22° apart, from which a poorly seen component is searched for in the CAD."""
+"""Directions, about 22° apart, from which a poorly seen component is searched for in the CAD."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class ComponentCoverage:
     Attributes:
         name: of the component.
         photos: indices of the poses from which it is seen.
-        directions: number of its viewing directions that differ by more than ``direction_deg``.
+        directions: number of its viewing directions that differ by more than ``DIRECTION_DEG``.
         spread_deg: largest angle between two of its viewing directions.
         gap_deg: largest range of azimuth, about the axis of the photos' orbit, without a photo of it; 360 if there is
             none.

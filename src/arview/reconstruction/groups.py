@@ -22,11 +22,11 @@ Members = tuple[int, ...]
 
 
 MIN_SHARED_POINTS = 15
-"""Across a cut; fewer can be due to chance."""
+"""Points that two groups of photos share; fewer can be due to chance."""
 MAX_RELATIVE_PX = 1.0
 """Standard deviation of one side's view of the other; more is not a common frame."""
 POINTS_OF_PHOTO = 60
-"""Points of a photo in which that deviation is evaluated."""
+"""Points of a photo in which ``MAX_RELATIVE_PX`` is evaluated."""
 
 
 def linked_groups(sparse: SparseModel) -> tuple[Members, ...]:

@@ -23,12 +23,12 @@ from arview.reconstruction.sparse import MAX_ERROR_PX, MIN_ANGLE_DEG, SparseOpti
 from arview.reconstruction.types import Photo, PosedPhoto, SparseModel
 
 MIN_PHOTOS = 16
-"""Placed photos; fewer than eight in a half leave gaps that the whole set does not have."""
+"""Placed photos that can be halved; fewer than eight in a half leave gaps that the whole set does not have."""
 
 
 @dataclass(frozen=True)
 class HalvesOptions:
-    """When a set is halved, and how the halves are adjusted."""
+    """How the halves of a set are adjusted."""
 
     sparse: SparseOptions = field(default_factory=SparseOptions)
 

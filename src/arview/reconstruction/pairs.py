@@ -26,19 +26,19 @@ MAX_PAIR_ANGLE_DEG = 45.0
 
 
 PREVIEW_FEATURES = 400
-"""Per photo, to choose the pairs to match; Wu 2013."""
+"""Features per photo that are compared to choose the pairs to match; Wu 2013."""
 PREVIEW_MATCHES = 5
-"""Of these that a chosen pair needs; chance gives 0 to 3."""
+"""Matches of these features that a chosen pair needs; chance gives 0 to 3."""
 ALL_PAIRS_UP_TO = 12
-"""Photos; up to this number every pair is matched."""
+"""Photos up to which every pair is matched."""
 NEIGHBOURS = 3
 """Following photos that are always matched: a walk around the part, a video."""
 HINTS_FROM = 30
 """Photos from which rough poses choose the pairs; fewer are matched as without them."""
 MAX_HINT_ANGLE_DEG = 60.0
-"""Between the directions of two rough poses; SIFT finds nothing beyond 45°."""
+"""Largest angle between the directions of two rough poses; SIFT finds nothing beyond 45°."""
 MIN_PARTNERS = 2
-"""Of a photo with a rough pose; with fewer, its pose is not trusted."""
+"""Matched partners of a photo with a rough pose; with fewer, its pose is not trusted."""
 
 
 @dataclass(frozen=True)

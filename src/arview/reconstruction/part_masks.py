@@ -54,7 +54,7 @@ class Silhouettes(Protocol):
 
 
 MIN_PLACED = 0.7
-"""Share of the photos; with fewer, the background may hold the others back."""
+"""Share of the photos that are placed; with fewer, the background may hold the others back."""
 MIN_FOUND = 3
 """Photos in which the part was found; fewer cannot be placed together."""
 

@@ -18,15 +18,15 @@ from arview.rendering.rasterizer import rasterise
 PIECES_ACROSS = 60
 """Pieces along the part's diameter: fine enough for a boundary of a face half seen."""
 MAX_PIECES = 200_000
-"""Of surface; larger models are divided less."""
+"""Pieces of the surface; larger models are divided less."""
 MAX_SIDE_PX = 800
-"""Of the rendered depth, in which hidden pieces are found."""
+"""Longer side of the rendered depth, in which hidden pieces are found."""
 MAX_INCIDENCE_DEG = 80.0
-"""Between the normal and the ray; beyond it a surface is a line in the photo."""
+"""Largest angle between the normal and the ray; beyond it a surface is a line in the photo."""
 DEPTH_TOLERANCE = 0.004
 """Relative depth by which a piece may lie behind the rendered surface."""
 NEEDED_PHOTOS = 2
-"""That determine a depth."""
+"""Photos that determine a depth."""
 
 
 @dataclass(frozen=True)

@@ -49,7 +49,7 @@ from arview.reconstruction.types import Photo, SparseModel
 from arview.reconstruction.unplaced import unplaced_photos, why_nothing
 
 MAX_EPIPOLAR_PX = 4.0
-"""In the first pass, before the distortion is known."""
+"""Distance from epipolar lines in the first pass, before the distortion is known."""
 BAND_PX = 2.0
 """Half width of the band around epipolar lines in the second pass."""
 MIN_MATCHES = 15
@@ -59,11 +59,11 @@ MAX_ERROR_PX = 2.0
 LAST_TOLERANCE = 1e-5
 """Relative decrease of the cost at which the last adjustment ends."""
 MIN_CENTRE_MOVE = 0.001
-"""Of the longer side; smaller moves of the principal point are not significant …."""
+"""Moves of the principal point, as a share of the longer side; smaller ones are not significant …."""
 MAX_CENTRE_MOVE = 0.05
 """… and larger ones mean that the views do not determine it."""
 MIN_ANGLE_DEG = 1.5
-"""Between two rays to a point; smaller angles do not determine depth."""
+"""Angle between two rays to a point; smaller ones do not determine depth."""
 
 
 @dataclass(frozen=True)

@@ -18,17 +18,17 @@ from arview.reconstruction.features import Features
 from arview.reconstruction.matching import MAX_ANGLE_RAD, Matches
 
 MAX_SHIFT_PX = 1.5
-"""Of a still feature between two photos; those of a part that turns move by more."""
+"""Largest shift of a still feature between two photos; features of a part that turns move by more."""
 COMPARED_PHOTOS = 8
-"""Others to which each photo is compared, spread over the set."""
+"""Other photos to which each photo is compared, spread over the set."""
 MIN_SHARE = 0.5
-"""Of these, in which the feature is found again at its place."""
+"""Share of the compared photos in which a still feature is found again at its place."""
 MIN_PHOTOS = 4
 """Sets with fewer photos are left as they are."""
 MAX_SIZE_RATIO = 1.5
-"""Between the sizes of a feature and of the one found again."""
+"""Largest ratio of the sizes of a feature and of the one found again."""
 USUAL_SHARE = 0.02
-"""Of a photo's features; fewer are chance, dirt on the lens or a watermark."""
+"""Share of a photo's features; fewer still ones are chance, dirt on the lens or a watermark."""
 CANDIDATES = 4
 """Nearest features that are compared with each feature."""
 

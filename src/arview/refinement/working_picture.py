@@ -37,7 +37,7 @@ STEPS_PER_OCTAVE = 2
 REACH = 1.15
 """Half size of the window, in half diameters of the part."""
 MARGIN_PX = 24.0
-"""Pixels of the reduced picture added to it."""
+"""Border that is added to the window, px of the reduced picture."""
 
 
 @dataclass(frozen=True)

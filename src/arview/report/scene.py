@@ -28,6 +28,7 @@ _REACH_MM = 3.0
 
 
 MAX_POINTS = 90_000
+"""Points of the cloud in the page."""
 MAX_FACES = 400_000
 """Triangles above which the CAD model is omitted, because the page would become slow."""
 MARGIN = 0.15

@@ -33,7 +33,7 @@ RECHECK_FRAMES = 15
 """While no component but the base is seen, it is searched for again after so many frames, because it may have been
 mistaken; no component is called missing before it is found there once more."""
 RESTLESS_FRAMES = 8
-"""The same where the pose jumps while components are absent."""
+"""Frames after which the base is searched for again where the pose jumps while components are absent."""
 WHOLE_FRAMES = 15
 """While a pose rests on the base alone, the whole part is searched for again after so many frames, because another
 thing may have been mistaken for the base."""

@@ -31,9 +31,9 @@ MAX_BLUR_PX = 2.5
 MIN_EDGES = 6
 """Edges needed for a measurement of the blur."""
 MIN_STEP_SHARE = 0.12
-"""Edges lower than this share of the brightest grey level are not used for it."""
+"""Edges lower than this share of the brightest grey level are not used to measure the blur."""
 MIN_STEP = 10.0
-"""Neither are edges lower than this many grey levels."""
+"""Edges lower than this many grey levels are not used to measure the blur."""
 MIN_QUALITY = 0.2
 """Hypotheses of a lower quality are found in any clutter, so they explain nothing."""
 FITTING_QUALITY = 0.5
@@ -55,7 +55,8 @@ OVERFLOW = 1.2
 LEFT_SHARE = 0.7
 """Share of the outline inside the picture below which a lost part has left the picture."""
 LEAVING_SHARE = 0.95
-"""Below this share it has, too, if its centre would soon have been outside."""
+"""Share of the outline inside the picture below which a lost part has left it, if its centre would soon have been
+outside."""
 LEAVING_FRAMES = 5
 """Frames after the loss in which the centre would have been outside."""
 MAX_MOTION = 0.07

@@ -72,21 +72,21 @@ MAX_SQUARED = 10.0
 """Squared Mahalanobis distance from which an innovation weighs less; one in eight normally distributed ones exceeds
 it."""
 ROBUST_GAIN = 1.06
-"""Factor that makes up for this in the mean of normally distributed innovations."""
+"""Factor that makes up for the smaller weight of large innovations in the mean of normally distributed ones."""
 MIN_UNUSUAL = 16.0
 """Squared Mahalanobis distance of an unusual innovation; one in seventy normally distributed ones exceeds it, more
 where motion has heavy tails."""
 MIN_UNUSUAL_MOTION = 0.005
 """Smallest squared length of an unusual innovation, about 3°."""
 MAX_USUAL_MOTION = 0.1
-"""Largest squared length of a usual one, about 14°: the refinement reaches no farther."""
+"""Largest squared length of a usual innovation, about 14°: the refinement reaches no farther."""
 UNREST_DECAY = 0.75
 """Factor by which the number of recent unusual innovations decreases in each frame."""
 MAX_UNREST = 1.4
 """Number of recent unusual innovations from which the pose is not to be trusted: two within four frames. A hand starts
 or stops; a wrong pose jumps again and again."""
 MAX_CALM_UNREST = 0.5
-"""Number up to which motion is calm: none within three frames."""
+"""Number of recent unusual innovations up to which motion is calm: none within three frames."""
 
 
 class MotionModel:

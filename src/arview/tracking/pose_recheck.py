@@ -45,7 +45,7 @@ RADIUS_PX = 90.0
 REACH = 1.25
 """Half size of the window, in half diameters of the part."""
 MARGIN_PX = 12.0
-"""Pixels added to it, after the reduction."""
+"""Pixels added to the window, after the reduction."""
 MIN_IN_PICTURE = 0.4
 """Share of the outline inside the window below which hypotheses are dropped."""
 SAME_DEG = 2.0

@@ -19,7 +19,7 @@ from arview.tracking.session_state import SessionState
 EAGER_FRAMES = 2
 """Frames after a loss in each of which the part is searched for."""
 SEARCH_EVERY = 3
-"""Later the part is searched for only so many frames after the last search."""
+"""After ``EAGER_FRAMES`` the part is searched for only so many frames after the last search."""
 THOROUGH_EVERY = 24
 """Frames from the end of one thorough search for a lost part to the next."""
 THOROUGH_PARTS = 3

@@ -57,7 +57,8 @@ LOST_FRAMES = 2
 CRITICAL_FRAMES = 45
 """Critical frames in a row after which the part is lost."""
 MIN_RESTING_SCORE = 0.7
-"""Correlation with the remembered appearance from which a place is examined in frames between these searches."""
+"""Correlation with the remembered appearance from which a place is examined in frames between two searches of the whole
+picture."""
 ALIGN_AGAIN_FRAMES = 60
 """Frames after a loss from which the part may be aligned with the guide view again."""
 ALIGN_ADVICE_EVERY = 10

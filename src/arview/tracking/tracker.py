@@ -55,7 +55,7 @@ SCORE_RATE = 0.1
 OTHER_SCHEDULES_SHARE = 0.97
 """Share of the usual score in the working picture below which other schedules are tried."""
 OTHER_SCHEDULES_FINE_SHARE = 0.85
-"""The same for the finest picture, in which scores vary more."""
+"""Share of the usual score in the finest picture, in which scores vary more, below which other schedules are tried."""
 NEAR_SCHEDULES_MIN_INNER_SHARE = 0.05
 """Share of design edges needed for schedules without colours, because the apparent outline of a rounded part moves with
 the light."""
@@ -64,7 +64,8 @@ FAR_SCHEDULES_SHARE = 0.9
 WIDE_SEARCH_SHARE = 0.8
 """Share of the usual score below which the part is searched for around the predicted pose."""
 SURPRISE_SHARE = 0.95
-"""The same for a pose whose squared motion distance exceeds ``SURPRISE``."""
+"""Share of the usual score below which the part is searched for around the predicted pose, where the squared motion
+distance exceeds ``SURPRISE``."""
 SURPRISE = 0.02
 """Squared motion distance of a surprising pose; 0.02 is about 6°."""
 MOTION_PENALTY = 0.15

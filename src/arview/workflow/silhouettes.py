@@ -34,22 +34,22 @@ from arview.rendering.rasterizer import rasterise
 from arview.version import __version__
 
 MARGIN_MM = 10.0
-"""Around the silhouette: twice the search range of the measurement and of the dense cloud."""
+"""Margin around the silhouette: twice the search range of the measurement and of the dense cloud."""
 PLACING_MARGIN_MM = 0.0
-"""The same where photos are placed by the part alone: any background misleads them."""
+"""Margin where photos are placed by the part alone: any background misleads them."""
 MAX_SIDE_PX = 1000
 """Longer side of the masks; they are scaled to their photos."""
 MAX_STRETCH = 3.0
 """Largest field of the undistorted view, relative to the photo."""
 ROUGH = CadOptions(max_views=6, rival_views=4, max_side_px=800)
+"""Rough placing is enough, because the margin covers its error."""
 
 
 @dataclass(frozen=True)
 class SilhouetteOptions:
-    """Size and margin of the masks, and how the part is found for them."""
+    """How exact the masks are."""
 
-    edge_px: float = 2.0  # added to ``margin_mm`` for the reduced size of the masks
-    # Rough placing is enough, because the margin covers its error.
+    edge_px: float = 2.0  # added to ``MARGIN_MM`` for the reduced size of the masks
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ from arview.geometry import Array, exp_so3, rigid
 from arview.pose import Identity, Pose, TrackingState
 from arview.station.capture import CaptureAdvice, CaptureGuide, CaptureOptions, capture_document, words
 from arview.station.capture.information import expected_error
+from arview.station.capture.options import MAX_STEP_DEG
 from helpers.cad_files import box
 from helpers.synthetic import component
 
@@ -193,7 +194,7 @@ def test_the_next_place_is_the_one_that_lowers_the_error_most(walk: Walk) -> Non
     known, weights = needs._known, needs._weights
     after = expected_error(known.with_each(dome.views)) @ weights
     photos = np.array(needs._directions)
-    in_reach = (dome.directions @ photos.T).max(axis=1) >= np.cos(np.radians(walk.guide.options.max_step_deg))
+    in_reach = (dome.directions @ photos.T).max(axis=1) >= np.cos(np.radians(MAX_STEP_DEG))
     is_open = np.array([index not in needs.filled for index in range(len(after))])
     assert is_open[next_cell] and in_reach[next_cell]
     assert after[next_cell] == pytest.approx(after[in_reach & is_open].min())

@@ -7,9 +7,17 @@ from collections.abc import Iterator
 import pytest
 
 from helpers.live_client import Http, Running, visiting
+from helpers.live_sample import patience
 
 
 @pytest.fixture
 def page(server: Running) -> Iterator[Http]:
     """A page of the module's server; at the end, no client is left."""
     yield from visiting(server)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def patient_servers() -> Iterator[None]:
+    """Servers of these tests are as patient as the machine is slow."""
+    with patience():
+        yield

@@ -10,7 +10,6 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -22,6 +21,7 @@ from arview.station.live.security.access import Access
 from arview.station.live.security.addresses import LOOPBACK
 from arview.station.live.security.limits import MAX_ADDRESSES, RateLimit
 from arview.station.live.security.refusals import Refusal
+from arview.station.live.server import app, uvicorn_server
 from arview.station.live.server.app import static_files
 from arview.station.live.server.uvicorn_server import TimeLimitedProtocol
 from arview.station.live.stream.frames import to_jpeg
@@ -154,11 +154,11 @@ def test_what_is_served_is_what_pages_need() -> None:
 
 @pytest.mark.slow
 def test_bodies_too_large_are_refused_by_what_they_say_and_by_what_they_are(server: Running, page: Http) -> None:
-    name, limits = page.join(), RequestLimits()
+    name = page.join()
     for path, kind, most in (
-        ("/api/clients", "application/json", limits.offer_bytes),
-        (f"/api/clients/{name}/control", "application/json", limits.control_bytes),
-        (f"/api/clients/{name}/frame?id=0", "image/jpeg", limits.jpeg_bytes),
+        ("/api/clients", "application/json", app.OFFER_BYTES),
+        (f"/api/clients/{name}/control", "application/json", app.CONTROL_BYTES),
+        (f"/api/clients/{name}/frame?id=0", "image/jpeg", app.JPEG_BYTES),
     ):
         status, _, content = page.ask("POST", path, b" " * (most + 1), Content_Type=kind)
         assert (status, json.loads(content)["error"]) == (413, "too_large")
@@ -187,9 +187,8 @@ def test_bodies_that_are_no_json_object(page: Http, content: bytes) -> None:
 
 @pytest.mark.slow
 def test_slow_headers_and_bodies_are_cut(server: Running, page: Http, monkeypatch: pytest.MonkeyPatch) -> None:
-    options = server.hub.options
-    monkeypatch.setattr(server.hub, "options", replace(options, requests=replace(options.requests, body_timeout_s=0.5)))
-    monkeypatch.setattr(TimeLimitedProtocol, "limits", ConnectionLimits(headers_timeout_s=0.7))
+    monkeypatch.setattr(app, "BODY_TIMEOUT_S", 0.5)
+    monkeypatch.setattr(uvicorn_server, "HEADERS_TIMEOUT_S", 0.7)
     began_s = time.monotonic()
     assert raw(server, b"GET / HTTP/1.1\r\nHost: x\r\nX-Slow: ", 8) == b""
     assert 0.3 < time.monotonic() - began_s < 5
@@ -204,7 +203,7 @@ def test_slow_headers_and_bodies_are_cut(server: Running, page: Http, monkeypatc
 
 @pytest.mark.slow
 def test_a_client_that_takes_no_answer_is_cut(server: Running, page: Http, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(TimeLimitedProtocol, "limits", ConnectionLimits(write_timeout_s=0.5))
+    monkeypatch.setattr(uvicorn_server, "WRITE_TIMEOUT_S", 0.5)
     with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as line:
         line.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
         line.settimeout(10)

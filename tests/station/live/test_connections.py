@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 
+from arview.station.live.security import connections
 from arview.station.live.security.addresses import LOOPBACK
 from arview.station.live.security.connections import ConnectionTable
 from arview.station.live.security.refusals import Refusal
@@ -28,8 +29,19 @@ def admitted(table: ConnectionTable, address: str, ports: range, closed: list[tu
     return sum(table.admit((address, port), lambda port=port: closed.append((address, port))) for port in ports)
 
 
-def test_strangers_make_room_for_each_other_and_guests_stay() -> None:
-    table = ConnectionTable(ConnectionLimits(strangers_of_address=4, max_strangers=10, handshakes_burst=1e6))
+@pytest.fixture(scope="module", autouse=True)
+def patient_servers() -> None:
+    """The servers of these tests have the limits of a station."""
+
+
+def limit(monkeypatch: pytest.MonkeyPatch, **limits: float) -> None:
+    for name, value in limits.items():
+        monkeypatch.setattr(connections, name, value)
+
+
+def test_strangers_make_room_for_each_other_and_guests_stay(monkeypatch: pytest.MonkeyPatch) -> None:
+    limit(monkeypatch, STRANGERS_OF_ADDRESS=4, MAX_STRANGERS=10, HANDSHAKES_BURST=1e6)
+    table = ConnectionTable()
     closed: list[tuple[str, int]] = []
     assert admitted(table, "a", range(4), closed) == 4 and not closed
     table.show_token(("a", 0))
@@ -44,8 +56,9 @@ def test_strangers_make_room_for_each_other_and_guests_stay() -> None:
     assert table.guests == 0
 
 
-def test_new_connections_of_one_address_are_rated_and_guests_are_counted() -> None:
-    table = ConnectionTable(ConnectionLimits(handshakes_per_s=0.1, handshakes_burst=5, max_guests=2))
+def test_new_connections_of_one_address_are_rated_and_guests_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    limit(monkeypatch, HANDSHAKES_PER_S=0.1, HANDSHAKES_BURST=5, MAX_GUESTS=2)
+    table = ConnectionTable()
     closed: list[tuple[str, int]] = []
     assert admitted(table, "a", range(20), closed) == 5 and admitted(table, "b", range(1), closed) == 1
     table.show_token(("a", 0))
@@ -60,7 +73,7 @@ def test_new_connections_of_one_address_are_rated_and_guests_are_counted() -> No
 @contextmanager
 def https_server(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[LiveServer]:
     monkeypatch.setenv("ARVIEW_DATA", str(folder))
-    chosen = options(max_age_s=None, connections=limits)
+    chosen = options(max_age_s=None)
     server = LiveServer(chosen, open_endpoint(LOOPBACK, 0))
     ready = threading.Event()
     thread = threading.Thread(
@@ -121,7 +134,7 @@ def test_idle_connections_of_one_address_stop_nobody(
             except OSError:
                 pass
             line.close()
-        assert 1 <= open_lines <= ConnectionLimits().strangers_of_address
+        assert 1 <= open_lines <= connections.STRANGERS_OF_ADDRESS
         assert time.monotonic() - began_s < 20
         before.close()
         new.close()

@@ -51,8 +51,11 @@ def test_devices_are_named_after_system_and_browser(user_agent: str, name: str) 
     assert device_name(user_agent) == name
 
 
-def test_one_too_many_takes_the_place_of_the_one_not_used_for_longest(tmp_path: Path) -> None:
-    devices = Devices(tmp_path / "devices.json", DeviceOptions(max_devices=3))
+def test_one_too_many_takes_the_place_of_the_one_not_used_for_longest(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("arview.station.live.security.devices.MAX_DEVICES", 3)
+    devices = Devices(tmp_path / "devices.json")
     tokens = [devices.pair(PHONE)[1] for _ in range(3)]
     assert devices.find(tokens[0])  # used now
     newest = devices.pair(PHONE)[1]
@@ -96,9 +99,10 @@ def test_a_damaged_file_is_set_aside(tmp_path: Path) -> None:
         assert Devices(path).find(token) == name
 
 
-def test_times_of_last_use_are_kept(tmp_path: Path) -> None:
+def test_times_of_last_use_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("arview.station.live.security.devices.SAVE_INTERVAL_S", 0.0)
     path = tmp_path / "devices.json"
-    devices = Devices(path, DeviceOptions(save_interval_s=0.0))
+    devices = Devices(path)
     _, token = devices.pair(PHONE)
     paired = read_devices(path)[0].last_used
     devices.find(token)
@@ -107,8 +111,9 @@ def test_times_of_last_use_are_kept(tmp_path: Path) -> None:
 
 
 @pytest.fixture
-def server(tmp_path: Path) -> Iterator[Running]:
-    chosen = options(devices=tmp_path / "devices.json", reload_interval_s=0.2)
+def server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Running]:
+    monkeypatch.setattr("arview.station.live.server.hub.RELOAD_INTERVAL_S", 0.2)
+    chosen = options(devices=tmp_path / "devices.json")
     with running(chosen, loader(chosen)) as server:
         yield server
 

@@ -28,9 +28,10 @@ from arview.inspection import load_inspection, save_inspection
 from arview.pose import Pose, TrackingState
 from arview.station.live.options import RecordingOptions
 from arview.station.live.protocol import NOTICE_CODES
+from arview.station.live.stream import recording
 from arview.station.live.stream.annotator import FrameAnnotator
 from arview.station.live.stream.documents import _source_name, pose_document
-from arview.station.live.stream.feed import Feed, TrackedFrame
+from arview.station.live.stream.feed import KEPT_FRAMES, Feed, TrackedFrame
 from arview.station.live.stream.frames import DecodedFrame, IncomingFrame
 from arview.station.live.stream.inspection_file import InspectionFile
 from arview.station.live.stream.newest import AsyncNewestSlot, NewestSlot
@@ -190,9 +191,8 @@ def test_memory_of_a_feed_is_bounded(closing: Callable[[Feed], Feed]) -> None:
     for number in range(200):
         feed.put(frame(number))
         wait(lambda number=number: feed.newest is not None and feed.newest.frame.frame_id == number)
-    kept = feed.options.kept_frames
-    assert len(feed._kept) == kept
-    assert feed.find(199 - kept) is None and feed.find(199 - kept + 1) is not None
+    assert len(feed._kept) == KEPT_FRAMES
+    assert feed.find(199 - KEPT_FRAMES) is None and feed.find(199 - KEPT_FRAMES + 1) is not None
 
 
 def test_an_error_of_the_tracker_is_reported_and_tracking_restarts(closing: Callable[[Feed], Feed]) -> None:
@@ -367,11 +367,12 @@ def test_a_recording_ends_before_the_disk_is_full(
 ) -> None:
     subject: Any = Scripted()
     feed = closing(feed_of(subject))
-    recorder = Recorder(feed, FrameAnnotator(subject), tmp_path / "out.mp4", RecordingOptions(check_interval_s=0.0))
+    monkeypatch.setattr(recording, "CHECK_INTERVAL_S", 0.0)
+    recorder = Recorder(feed, FrameAnnotator(subject), tmp_path / "out.mp4", RecordingOptions())
     feed.put(frame(1))
     wait(lambda: feed.newest is not None and feed.newest.frame.frame_id == 1)
     time.sleep(0.2)
-    monkeypatch.setattr(recorder, "_options", RecordingOptions(check_interval_s=0.0, min_free_bytes=1 << 60))
+    monkeypatch.setattr(recording, "MIN_FREE_BYTES", 1 << 60)
     feed.put(frame(2))
     wait(lambda: not recorder.is_running)
     assert recorder.stop() and len(list(open_source(tmp_path / "out.mp4"))) == 1

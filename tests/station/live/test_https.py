@@ -23,7 +23,7 @@ from cryptography.x509.verification import PolicyBuilder, Store, VerificationErr
 from arview.errors import InputError, OutputError
 from arview.station.live.security import addresses
 from arview.station.live.security.addresses import LOOPBACK, Interface, bind, choose_host
-from arview.station.live.security.certificates import local_certificates, own_certificates
+from arview.station.live.security.certificates import AUTHORITY_DAYS, SERVER_DAYS, local_certificates, own_certificates
 from arview.station.live.security.trust_page import apple_profile, fingerprint
 from arview.station.live.server.live_server import LiveServer, open_endpoint
 from helpers.live_sample import loader, options
@@ -51,8 +51,8 @@ def test_certificates_are_what_browsers_ask_for(tmp_path: Path) -> None:
     usage = server.extensions.get_extension_for_class(x509.ExtendedKeyUsage).value
     assert list(usage) == [ExtendedKeyUsageOID.SERVER_AUTH]
     days = (server.not_valid_after_utc - NOW) / timedelta(days=1)
-    assert days == LIFETIMES.server_days
-    assert (authority.not_valid_after_utc - NOW) / timedelta(days=1) == LIFETIMES.authority_days
+    assert days == SERVER_DAYS
+    assert (authority.not_valid_after_utc - NOW) / timedelta(days=1) == AUTHORITY_DAYS
 
 
 def test_keys_are_for_this_user_only(tmp_path: Path) -> None:
@@ -97,12 +97,12 @@ def test_leaf_is_renewed_when_it_ends_soon_or_the_address_changes_and_the_author
     local_certificates(HERE, tmp_path, NOW + timedelta(days=70))
     renewed = leaf(tmp_path)
     assert renewed.serial_number != serial
-    assert renewed.not_valid_after_utc == NOW + timedelta(days=70 + LIFETIMES.server_days)
+    assert renewed.not_valid_after_utc == NOW + timedelta(days=70 + SERVER_DAYS)
     moved = local_certificates(["10.0.0.5"], tmp_path, NOW + timedelta(days=71))
     assert leaf(tmp_path).serial_number != renewed.serial_number
     assert moved.authority_der == first.authority_der
     # Years later the authority itself is replaced in time.
-    later = local_certificates(["10.0.0.5"], tmp_path, NOW + timedelta(days=LIFETIMES.authority_days - 60))
+    later = local_certificates(["10.0.0.5"], tmp_path, NOW + timedelta(days=AUTHORITY_DAYS - 60))
     assert later.is_authority_new and later.authority_der != first.authority_der
 
 

@@ -16,6 +16,7 @@ import pytest
 
 from arview.cad import load_part
 from arview.cad.part import Part
+from arview.station.live.jobs import workers as workers_module
 from arview.station.live.jobs.workers import WorkerQueue, running_worker
 from arview.station.live.options import JobOptions
 from arview.station.walk.job import JobFolder
@@ -104,10 +105,13 @@ def test_one_runs_at_a_time_and_the_next_follows(part: Part, tmp_path: Path, mad
     wait(lambda: workers.done == [two.id])
 
 
-def test_a_worker_that_only_waits_makes_room_and_is_started_again(part: Part, tmp_path: Path, made: Any) -> None:
+def test_a_worker_that_only_waits_makes_room_and_is_started_again(
+    part: Part, tmp_path: Path, made: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(workers_module, "PATIENCE_S", 0.3)
     walking = job_with_photos(part, tmp_path, "BP-1", is_ended=False)
     ended = job_with_photos(part, tmp_path, "BP-2")
-    workers = made(patience_s=0.3)
+    workers = made()
     workers.queue.ask(walking)
     workers.queue.tick()
     workers.queue.ask(ended)
@@ -138,9 +142,12 @@ def test_a_cloud_makes_room_at_once_and_comes_last(part: Part, tmp_path: Path, m
     workers.tick_until(lambda: workers.started == [cloud.id, other.id, cloud.id])
 
 
-def test_one_that_breaks_is_started_again_a_few_times(part: Part, tmp_path: Path, made: Any) -> None:
+def test_one_that_breaks_is_started_again_a_few_times(
+    part: Part, tmp_path: Path, made: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(workers_module, "WORKER_PAUSES_S", (0.05, 0.1))
     job = job_with_photos(part, tmp_path, "BP-1")
-    workers = made("import sys; sys.exit(3)", worker_pauses_s=(0.05, 0.1))
+    workers = made("import sys; sys.exit(3)")
     workers.queue.ask(job)
     workers.tick_until(lambda: workers.queue.state(job.id) == "failed")
     assert len(workers.started) == 3
@@ -187,10 +194,13 @@ def test_the_end_of_a_walk_is_no_reason_to_measure_twice_and_a_late_photo_is(
     assert len(workers.started) == 3
 
 
-def test_workers_end_with_the_server_also_those_that_do_not_listen(part: Part, tmp_path: Path, made: Any) -> None:
+def test_workers_end_with_the_server_also_those_that_do_not_listen(
+    part: Part, tmp_path: Path, made: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(workers_module, "WORKER_STOP_S", 0.4)
     deaf = "import signal, time\nsignal.signal(signal.SIGTERM, signal.SIG_IGN)\nwhile True: time.sleep(0.1)"
     one, two = (job_with_photos(part, tmp_path, f"BP-{k}") for k in (1, 2))
-    workers = made(workers=2, worker_stop_s=0.4)
+    workers = made(workers=2)
     workers.queue.ask(one)
     workers.queue.tick()
     workers.code = deaf

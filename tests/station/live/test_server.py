@@ -345,8 +345,9 @@ def test_pages_wait_while_the_part_is_loaded() -> None:
 
 
 @pytest.mark.slow
-def test_silent_pages_leave_by_themselves() -> None:
-    chosen = options(jpeg_silence_s=0.5)
+def test_silent_pages_leave_by_themselves(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("arview.station.live.server.hub.JPEG_SILENCE_S", 0.5)
+    chosen = options()
     with running(chosen, loader(chosen)) as server:
         page = server.session()
         page.join()

@@ -71,9 +71,11 @@ def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def playing(clip: Path) -> Iterator[Running]:
-    chosen = options(source=str(clip), max_age_s=None, watchers=2)
-    with running(chosen, loader(chosen)) as server:
-        yield server
+    chosen = options(source=str(clip), max_age_s=None)
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr("arview.station.live.server.app.WATCHERS", 2)
+        with running(chosen, loader(chosen)) as server:
+            yield server
 
 
 def newest(page: Http, name: str, after: int = -1) -> tuple[dict[str, Any], Image]:
@@ -171,7 +173,8 @@ def test_twenty_pages_show_one_station(clip: Path) -> None:
 def test_camera_that_breaks_is_told_and_comes_back(monkeypatch: pytest.MonkeyPatch) -> None:
     cable = Cable()
     monkeypatch.setattr(station, "open_source", cable.open)
-    chosen = options(source="0", max_age_s=None, station=StationOptions(frozen_s=1.2))
+    monkeypatch.setattr(station, "FROZEN_S", 1.2)
+    chosen = options(source="0", max_age_s=None)
     with running(chosen, loader(chosen)) as server:
         page = server.session()
 

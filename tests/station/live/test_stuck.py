@@ -9,7 +9,6 @@ import subprocess
 import sys
 import threading
 import time
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -21,6 +20,9 @@ from arview.camera.read import guess_camera
 from arview.pose import Pose, TrackingState
 from arview.station.live.options import RecordingOptions
 from arview.station.live.server.workers import StuckError, WorkerPool
+from arview.station.live.stream import annotator as annotator_module
+from arview.station.live.stream import feed as feed_module
+from arview.station.live.stream import recording as recording_module
 from arview.station.live.stream import station as station_module
 from arview.station.live.stream.annotator import FrameAnnotator
 from arview.station.live.stream.feed import Feed
@@ -30,13 +32,20 @@ from helpers.live_client import wait
 from helpers.live_sample import CLIP, PART, options
 
 
+@pytest.fixture(autouse=True)
+def soon_stuck(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What does not come back is given up soon."""
+    monkeypatch.setattr(feed_module, "STUCK_S", 0.3)
+    monkeypatch.setattr(annotator_module, "DRAW_TIMEOUT_S", 0.3)
+
+
 class Subject(list[Any]):
     """A subject whose session never comes back from frame 1, and whose overlay never from serial 3."""
 
     def __init__(self, **changes: Any) -> None:
         super().__init__([SimpleNamespace(name="")])
         self.serial_numbers = [None]
-        self.options = replace(options(), feed=FeedOptions(stuck_s=0.3, draw_timeout_s=0.3))
+        self.options = options()
         self.revision, self.sessions, self.stuck, self.drawing = 1, 0, threading.Event(), threading.Event()
         self.never = threading.Event()
 
@@ -157,8 +166,9 @@ def test_a_camera_that_never_answers_is_opened_anew(monkeypatch: pytest.MonkeyPa
         raise RuntimeError
 
     monkeypatch.setattr(station_module, "open_source", open_source)
+    monkeypatch.setattr(station_module, "STUCK_S", 0.2)
     feed = Feed(subject, "station")
-    camera = station_module.StationCamera("rtsp://user:secret@host/1", feed, StationOptions(stuck_s=0.2))
+    camera = station_module.StationCamera("rtsp://user:secret@host/1", feed)
     wait(lambda: camera.replace_if_stuck() or len(opened) == 2)
     assert camera.state[0] == "reconnecting" and "secret" not in camera.state[1]
     camera._ended.set()
@@ -166,11 +176,13 @@ def test_a_camera_that_never_answers_is_opened_anew(monkeypatch: pytest.MonkeyPa
     feed.close()
 
 
-def test_recordings_end_at_their_quota_and_say_so(tmp_path: Path) -> None:
+def test_recordings_end_at_their_quota_and_say_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(recording_module, "LOW_BYTES", 10_000_000)
+    monkeypatch.setattr(recording_module, "CHECK_INTERVAL_S", 0.0)
     subject: Any = Subject()
     feed = Feed(subject, "phone")
     (tmp_path / "live_old_1.mp4").write_bytes(bytes(5000))
-    limits = RecordingOptions(quota_bytes=1_000_000, low_bytes=10_000_000, check_interval_s=0.0)
+    limits = RecordingOptions(quota_bytes=1_000_000)
     assert free_space(tmp_path, limits).free_bytes == 995_000
     recordings = Recordings(tmp_path, "part", limits)
     recordings.start(feed, FrameAnnotator(subject))
@@ -187,7 +199,8 @@ def test_recordings_end_at_their_quota_and_say_so(tmp_path: Path) -> None:
     assert recordings.finished == [0] and recordings.path(0).stat().st_size > 500  # type: ignore[union-attr]
     recordings.start(feed, FrameAnnotator(subject))  # it is refused, and said
     assert recordings.of(feed) is None and [one.code for one in recordings.notices(feed)] == ["recording_ended"]
-    full = free_space(tmp_path, RecordingOptions(min_free_bytes=1 << 62))
+    monkeypatch.setattr(recording_module, "MIN_FREE_BYTES", 1 << 62)
+    full = free_space(tmp_path, RecordingOptions())
     assert "disk is almost full" in full.exhausted
     feed.close()
 

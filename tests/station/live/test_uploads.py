@@ -16,6 +16,7 @@ import pytest
 
 from arview.cad import load_part
 from arview.cad.part import Part
+from arview.station.live.jobs import uploads as uploads_module
 from arview.station.live.jobs.uploads import PhotoSpace, Uploads, folder_bytes
 from arview.station.live.security.refusals import Refusal
 from arview.station.walk.job import JobFolder
@@ -118,13 +119,15 @@ def test_wrong_announcements_are_refused(part: Part, tmp_path: Path, changed: di
     assert uploads.listed() == []
 
 
-def test_bounds_on_photos_and_uploads(part: Part, tmp_path: Path) -> None:
+def test_bounds_on_photos_and_uploads(part: Part, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     job = new_job(part, tmp_path)
-    uploads = uploads_of(job, tmp_path, max_photos=2, max_open_uploads=2, photo_bytes=300_000)
+    for name, value in {"MAX_PHOTOS": 2, "MAX_OPEN_UPLOADS": 2, "PHOTO_BYTES": 300_000}.items():
+        monkeypatch.setattr(uploads_module, name, value)
+    uploads = uploads_of(job, tmp_path)
     assert [sent(uploads, photo(number)) for number in (1, 2)] == ["0001.jpg", "0002.jpg"]
     assert refused(lambda: uploads.begin(about(photo(3)))).code == "too_many"
     assert uploads.begin(about(photo(1))) == "0001.jpg"  # one that is stored is no further one
-    other = uploads_of(new_job(part, tmp_path, "BP-2"), tmp_path, max_open_uploads=2)
+    other = uploads_of(new_job(part, tmp_path, "BP-2"), tmp_path)
     begun = [other.begin(about(photo(number))) for number in (1, 2)]
     assert refused(lambda: other.begin(about(photo(3)))).status == 429
     assert not isinstance(begun[0], str)
@@ -171,12 +174,14 @@ def test_a_full_disk_keeps_what_was_confirmed_and_nothing_half(
     assert sent(uploads, content) == "0002.jpg"  # there is room again
 
 
-def test_quota_and_reserve_are_kept(part: Part, tmp_path: Path) -> None:
+def test_quota_and_reserve_are_kept(part: Part, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     job = new_job(part, tmp_path)
-    full = uploads_of(job, tmp_path, quota_bytes=300_000)
-    sent(full, photo(1))
-    assert folder_bytes(tmp_path / "jobs") > 150_000
-    assert refused(lambda: sent(full, photo(2))).status == 507
+    full = uploads_of(job, tmp_path)
+    with monkeypatch.context() as patched:
+        patched.setattr(uploads_module, "QUOTA_BYTES", 300_000)
+        sent(full, photo(1))
+        assert folder_bytes(tmp_path / "jobs") > 150_000
+        assert refused(lambda: sent(full, photo(2))).status == 507
     reserve = uploads_of(job, tmp_path, min_free_bytes=10**18)
     assert refused(lambda: reserve.begin(about(photo(3)))).code == "disk_full"
     assert len(job.photos()) == 1

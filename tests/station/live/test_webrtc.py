@@ -20,7 +20,7 @@ from arview.station.live.transport.receiving import (
     BoundedFrameQueue,
     PromptJitterBuffer,
 )
-from arview.station.live.transport.webrtc import _checked_offer, _with_bitrates
+from arview.station.live.transport.webrtc import MAX_CANDIDATES, _checked_offer, _with_bitrates
 from helpers.live_client import Camera, Phone, Running, running
 from helpers.live_sample import HEIGHT, WIDTH, errors, frames, loader, nearest, options, there_and_back, truth
 
@@ -193,7 +193,7 @@ OFFERS = {
     "no codec": "v=0\r\no=- 0 0 IN IP4 127.0.0.1\r\ns=-\r\nt=0 0\r\nm=video 9 UDP/TLS/RTP/SAVPF 96\r\n"
     "m=application 9 UDP/DTLS/SCTP webrtc-datachannel\r\n",
     "candidates": "v=0\r\no=- 0 0 IN IP4 127.0.0.1\r\ns=-\r\nt=0 0\r\n"
-    + (WebrtcOptions().max_candidates + 1) * "a=candidate:1 1 udp 1 127.0.0.1 9 typ host\r\n",
+    + (MAX_CANDIDATES + 1) * "a=candidate:1 1 udp 1 127.0.0.1 9 typ host\r\n",
     "binary": "\x00\xff\u2028" * 100,
 }
 
@@ -278,8 +278,9 @@ def test_clients_that_vanish_again_and_again_leave_nothing_behind(
     assert phones.session().json("GET", "/api/status")[1]["clients"] == 0
 
 
-def test_an_offer_without_a_page_behind_it_is_forgotten() -> None:
-    chosen = options(webrtc=WebrtcOptions(connect_timeout_s=1.0))
+def test_an_offer_without_a_page_behind_it_is_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("arview.station.live.server.hub.CONNECT_TIMEOUT_S", 1.0)
+    chosen = options()
 
     async def go(server: Running) -> None:
         phone = Phone(server.session(), camera())

@@ -30,7 +30,7 @@ except (ImportError, ValueError, OSError):
 WALL_FACTOR = 4.0
 """Seconds of waiting for one of computing, on a machine that is shared."""
 OUTPUT_MB = 1000.0
-"""Largest file that it writes, MB."""
+"""Largest file that the process may write, MB."""
 
 
 @dataclass(frozen=True)

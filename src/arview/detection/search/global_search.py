@@ -86,12 +86,12 @@ RESPONSE_WEIGHT = 20.0
 MAX_OCTAVES = 2.6
 """A wider range of sizes is searched in two parts, so that the usual sizes take no longer."""
 CORE_FILL = (0.18, 0.85)
-"""The part's diameter in the picture, as shares of its longer side, in the first of these parts."""
+"""The part's diameter in the picture, as shares of its longer side, in the search for usual sizes."""
 CUT_FILL = 0.7
 """The part's diameter, as a share of the picture's shorter side, from which it is also searched where the picture's
 border cuts it."""
 CUT_MARGIN = 0.4
-"""Distance that its templates may reach out of the response maps, as a share of ``radius_px``."""
+"""Distance that templates of cut parts may reach out of the response maps, as a share of ``radius_px``."""
 MIN_MAP_PX = 16
 """Side of a response map, without its border, below which nothing is searched."""
 

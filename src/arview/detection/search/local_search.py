@@ -85,15 +85,15 @@ PREVIOUS_WEIGHT = 0.5
 MAX_COARSE = 16
 """Results of the pattern search that are refined through the coarse schedules."""
 COARSE_SCHEDULES: tuple[Schedule, ...] = (COARSE_STAGES, COARSE_COLOUR_STAGES)
-"""Schedules tried from each of these."""
+"""Schedules tried from each result of the pattern search."""
 MAX_FINE = 5
 """Hypotheses that are refined to the end."""
 MAX_COMPETITORS = 3
 """Further hypotheses for clearly different poses that are refined to the end; the margin over them tells whether the
 best one stands out."""
 FINE_SCHEDULES: tuple[Schedule, ...] = (SEARCH_STAGES, NEAR_STAGES)
-"""Schedules tried from each of these: with edges and colours, and with nearby edges alone, because occluders shift the
-colour statistics."""
+"""Schedules tried from each hypothesis: with edges and colours, and with nearby edges alone, because occluders shift
+the colour statistics."""
 SHADING_STAGES: Schedule = SEARCH_STAGES[-1:]
 """Stages before the shading is used."""
 COARSE_TOLERANCE_PX = 3.5
@@ -108,7 +108,7 @@ COMPETITOR_DISTINCT_DEG = 15.0
 MIN_SCORE = 0.35
 """Evidence score of the best pose below which no poses around it are tried."""
 NEIGHBOURHOOD_RAD = 0.05
-"""Rotation of the poses that are tried around it."""
+"""Rotation of the poses that are tried around the best one."""
 MAX_SHADING_LOSS = 3.0
 """Largest drop in log odds accepted from the shading refinement."""
 MIN_IN_IMAGE = 0.4
@@ -120,10 +120,10 @@ MAX_SIDE_PX = 1280
 SIDE_UNIT_PX = 8
 """Sides of reduced images are multiples of this, so that they can be halved."""
 SCALE = WorkingScaleOptions(radius_px=120.0, max_enlargement=1.0)
-"""Of the images in which poses are refined and measured, by the size of the part."""
+"""Options of the images in which poses are refined and measured, by the size of the part."""
 OUTLINE_SCALE = WorkingScaleOptions(radius_px=64.0, max_enlargement=1.0)
-"""Of the images in which the outline alone is judged: smaller, so that what differs between part and CAD by less than
-some hundredths of the diameter does not count."""
+"""Options of the images in which the outline alone is judged: smaller, so that what differs between part and CAD by
+less than some hundredths of the diameter does not count."""
 
 
 @dataclass(frozen=True)

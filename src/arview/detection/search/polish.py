@@ -11,9 +11,9 @@ from arview.refinement.working_picture import MARGIN_PX, WorkingScaleOptions, wi
 MIN_GAIN = 1.3
 """How much larger than the working picture the finest one must be to be worth its time."""
 STAGES: tuple[Stage, ...] = SEARCH_STAGES + LAST_STAGES
-"""Through which a pose is refined."""
+"""Stages through which a pose is refined."""
 MAX_TURN_DEG = 4.0
-"""A pose may turn by this, and move by as many hundredths of the diameter."""
+"""A pose may turn by this angle, and move by as many hundredths of the diameter."""
 MAX_LOSS = 0.03
 """Drop of the evidence score up to which the refined pose is kept."""
 TOLERANCE_PX = 1.5

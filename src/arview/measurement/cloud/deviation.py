@@ -58,7 +58,7 @@ MAX_STD_MM = 0.5
 MISSING_SHARE = 0.2
 """A component is missing when a smaller share of its visible surface has a point within the band."""
 MIN_POINTS = 60
-"""Of a component."""
+"""Points of a component needed to measure it."""
 RIVAL_COST = 1.5
 """A second minimum is reported when its cost is less than this many times the best one's."""
 SCANNED_MM = 6.0

@@ -22,11 +22,11 @@ from arview.reconstruction.scale.similarity import Similarity
 from arview.reconstruction.types import DenseCloud
 
 POINTS = 4000
-"""Of cloud and CAD each; a few for each voxel."""
+"""Points of cloud and CAD each; a few for each voxel."""
 VOXELS = 40
-"""Across the diameter: components are some voxels wide."""
+"""Voxels across the diameter: components are some voxels wide."""
 STEP_DEG = 6.0
-"""Between rotations about a principal direction; refinement converges from half of it."""
+"""Step of the rotations about a principal direction; refinement converges from half of it."""
 KEPT = 12
 """Poses that are refined and compared."""
 SCALE_STEP = 1.08
@@ -38,6 +38,7 @@ LIMIT_SHARE = 0.015
 MIN_LEAD = 1.08
 """Cost of the next best pose over the best one's, below which it is ambiguous."""
 SEED = 0
+"""Seed of the choice of points."""
 
 
 def find_model_in_cloud(cloud: DenseCloud, model: Model, scale: float | None = 1.0) -> Similarity:

@@ -27,17 +27,17 @@ from arview.measurement.cloud.scene_points import ScenePoints, plane_weights, sc
 MODEL_POINTS = 2400
 """Points of the CAD whose pairs are matched."""
 FIRST_PAIRS = 7000
-"""The same in the first round, which finds what is the main thing in the cloud."""
+"""Pairs of the cloud that are matched in the first round, which finds what is the main thing in the cloud."""
 PROBES = 3
 """Cells of the table in which each pair is looked up, because noise moves it between them."""
 MATCHES = 40
-"""Pairs of the CAD that are tried for each of them, at random if there are more."""
+"""Pairs of the CAD that are tried for each pair of the cloud, at random if there are more."""
 PAIR_RANGE = (0.06, 0.55)
 """Distance of the points of a pair."""
 DISTANCE_STEP = 0.03
 """Step of the table of pairs for distances."""
 ANGLE_STEP_DEG = 12.0
-"""The same for angles."""
+"""Step of the table of pairs for angles."""
 PARALLEL_DEG = 25.0
 """Normals at a smaller angle do not determine a pose."""
 FIELD_CELLS = 84
@@ -45,7 +45,7 @@ FIELD_CELLS = 84
 COARSE_REACH = 0.03
 """Distance within which points support a hypothesis."""
 FINE_REACH = 0.008
-"""The same after refinement; components may be displaced by less."""
+"""Distance within which points support a hypothesis after refinement; components may be displaced by less."""
 SCORED = 160
 """Points on which a hypothesis is scored."""
 REFINED = 4
@@ -55,7 +55,7 @@ KEPT = 28
 MIN_SHARE = 0.15
 """Weighted share of the CAD that must be found in the cloud."""
 SURE_SHARE = 0.35
-"""With as much of it found, normals are not tried the other way round."""
+"""With as much of the CAD found, normals are not tried the other way round."""
 MAX_INSIDE = 0.25
 """Share of the points near the CAD that may lie inside of it."""
 MIN_LEAD = 1.06
@@ -65,6 +65,7 @@ LIST_BLOCK = 2_000_000
 ROUNDS = 4
 """Searches with other pairs, until the part is found."""
 SEED = 0
+"""Seed of the choice of pairs and points."""
 
 
 @dataclass(frozen=True)

@@ -35,7 +35,7 @@ MIN_INFORMATION = 1e-4
 """Motions with less information per point, as a share of the largest possible, are undetermined; rotations are
 converted by the size of the cloud."""
 SEED = 0
-"""Of the choice of these points."""
+"""Seed of the choice of points."""
 
 
 @dataclass(frozen=True)

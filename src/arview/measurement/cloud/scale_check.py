@@ -32,6 +32,7 @@ SIGNIFICANT = 3.0
 MIN_EXCESS = 3e-4
 """Smaller relative differences are not reported as contradictions."""
 STEPS = 15
+"""Largest number of steps of the fit of the scale."""
 
 
 @dataclass(frozen=True)

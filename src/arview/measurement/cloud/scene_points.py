@@ -18,9 +18,9 @@ Flags = NDArray[np.bool_]
 MAX_POINTS = 400_000
 """Points that are looked at, at random if there are more."""
 COARSE = 0.014
-"""Cell of the grid for pairs."""
+"""Cell of the grid for pairs, in diameters of the part."""
 FINE = 0.006
-"""Cell of the grid for judging places."""
+"""Cell of the grid for judging places, in diameters of the part."""
 MAX_COARSE = 9000
 """Points for pairs; with more the cells grow."""
 NORMAL_NEIGHBOURS = 24
@@ -42,8 +42,9 @@ FLAT_VARIATION = 0.05
 MIN_FLAT = 0.005
 """Share of such neighbourhoods below which the points lie on no surface."""
 MIN_FLAT_POINTS = 1000
-"""Points from which this is asked."""
+"""Points of a cloud from which ``MIN_FLAT`` is asked for."""
 SEED = 0
+"""Seed of the choice of points."""
 
 
 @dataclass(frozen=True)

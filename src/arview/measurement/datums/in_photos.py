@@ -34,9 +34,9 @@ from arview.measurement.photo.views import PhotoViews
 from arview.measurement.types import Move
 
 SAMPLES = 500
-"""On a plane; errors of denser samples are correlated."""
+"""Samples on a plane; errors of denser samples are correlated."""
 RIM_POINTS = 120
-"""Around a hole; about one px apart on small ones."""
+"""Points around a hole; about one px apart on small ones."""
 RIM_PX = 0.04
 """Expected standard uncertainty of a rim's position by rust, chalk and burrs beside it."""
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 CLEAR_MM = 8.0
 """Distance to other components: weld beads and spatter lie within a leg's length of the joint."""
 MIN_CLEAR_MM = 2.0
-"""The same where a plane has no room for more."""
+"""Distance to other components where a plane has no room for ``CLEAR_MM``."""
 POINT_RADIUS_MM = 4.0
-"""Of the disc around a datum point that is measured; a few patches."""
+"""Radius of the disc around a datum point that is measured; a few patches."""
 REACH_MM = 1.0
 """Largest distance of a feature from its rough place."""

@@ -23,7 +23,7 @@ MeasureDatum = Callable[[Datum], DatumEquations]
 TRIED = 4
 """Other features measured for each datum; each takes about a second."""
 MIN_FACE_SHARE = 0.05
-"""Of the component's area, for a face that can be a datum."""
+"""Share of the component's area of a face that can be a datum."""
 
 
 @dataclass(frozen=True)

@@ -53,7 +53,7 @@ MIN_SUPPORT = 0.25
 FIRST_RIVAL_PX = 3.0
 """In the first rounds, points with another edge nearer beside them are left out."""
 RIVAL_PX = 2.0
-"""The same in the last rounds: blur merges nearer steps."""
+"""In the last rounds, points with another edge nearer beside them are left out: blur merges nearer steps."""
 RIVAL_REACH_PX = 6.0
 """An edge farther than this is no rival: the last rounds search half as far."""
 FINE_ROUNDS = 3

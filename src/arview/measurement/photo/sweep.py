@@ -32,19 +32,19 @@ from arview.measurement.types import Move, NotMeasured
 from arview.rendering.raycast import RayCaster
 
 SAMPLES = 1000
-"""On a component's surface; more of them overlap and add cost without information."""
+"""Samples on a component's surface; more of them overlap and add cost without information."""
 PATCH_PX = 13
 """Width of a patch: smaller ones are noisy, larger ones bridge the edges of small parts."""
 PATCH_POINTS = 9
-"""Across a patch; a spacing of 1.5 px loses nothing and halves the time."""
+"""Points across a patch; a spacing of 1.5 px loses nothing and halves the time."""
 SWEEP_EDGE_PX = 4.0
 """Samples nearer to a sharp edge are dropped: blur mixes them with what lies beyond."""
 SAMPLE_SPACING_PX = 5.0
-"""About half a patch, so that each surface point lies in four patches."""
+"""Spacing of the samples: about half a patch, so that each surface point lies in four patches."""
 MAX_VIEWS = 7
 """Photos in which a sample is compared."""
 MIN_VIEWS = 3
-"""With fewer, two may agree by chance."""
+"""Photos in which a sample must be seen; of fewer, two may agree by chance."""
 MIN_COSINE = 0.35
 """Smallest cosine between view and surface normal: 70°."""
 CAPTURE_MM = 5.0
@@ -52,7 +52,7 @@ CAPTURE_MM = 5.0
 FINE_RANGE_PX = 3.0
 """Search range of the first fine round; it narrows from round to round."""
 ROUNDS = 5
-"""Maximum; patches are cut anew at the moved place."""
+"""Largest number of rounds; patches are cut anew at the moved place."""
 CONVERGED_MM = 0.003
 """A smaller step ends the rounds."""
 MIN_SCORE = 0.55

@@ -35,7 +35,7 @@ PROBABILITY = 0.95
 
 @dataclass(frozen=True)
 class UncertaintyOptions:
-    """Contributions that no covariance contains, and how the result is computed."""
+    """How the uncertainty of the result is computed."""
 
     draws: int = 20_000  # JCGM 101 asks for 1e4 / (1 - p) for two digits; 20,000 give U with 0.7 % of noise
     seed: int = 0

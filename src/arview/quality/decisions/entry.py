@@ -17,9 +17,9 @@ FIRST = "0" * 64
 
 
 NAME = 200
-"""Names of people, components and photos."""
+"""Longest names of people, components and photos, characters."""
 TEXT = 4000
-"""Reasons and notes."""
+"""Longest reasons and notes, characters."""
 
 
 @dataclass(frozen=True)

@@ -26,11 +26,13 @@ PLAN_WIDTH_MM = 110.0
 SIDE_WIDTH_MM = 64.0
 MIN_PLAN_HEIGHT_MM = 64.0
 MAX_PLAN_HEIGHT_MM = 120.0
+"""Width of the drawing, widths of the plan and of the side view, and limits of the height of the plan, mm on paper."""
 MARGIN_MM = 14.0
-"""Around the component in the plan."""
+"""Room around the component in the plan, mm on paper."""
 HEAD_MM = 8.0
-"""For the name; the lines of the moves come on top."""
+"""Room for the name; the lines of the moves come on top."""
 MAX_MAGNIFICATION = 200.0
+"""Largest factor by which moves are drawn longer than they are."""
 
 
 @dataclass(frozen=True)

@@ -32,13 +32,13 @@ MAX_DECIMALS = 2
 
 
 SIDEWAYS_SHARE = 0.25
-"""Of the tolerance: what may remain beside a move that is called by a near direction."""
+"""Share of the tolerance that may remain beside a move that is called by a near direction."""
 MIN_SHARE = 0.1
-"""Of the tolerance: shorter moves are not asked for either."""
+"""Share of the tolerance; shorter moves are not asked for either."""
 END_SHARE = 0.5
-"""Of the tolerance: a turn that moves the ends by more is asked for without an angle limit."""
+"""Share of the tolerance; a turn that moves the ends by more is asked for without an angle limit."""
 MIN_TURN_DEG = 0.02
-"""Below which no turn is asked for."""
+"""Smaller turns are not asked for."""
 
 
 def instructions(part: Part, inspection: Inspection) -> tuple[Instruction, ...]:

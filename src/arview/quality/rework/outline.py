@@ -44,11 +44,11 @@ class ParallelView:
 CREASE_DEG = 30.0
 """Angle between two faces above which their edge is drawn."""
 PIXELS = 900
-"""Of the z-buffer along the longer side of a window."""
+"""Pixels of the z-buffer along the longer side of a window."""
 STEP_PX = 2.0
 """Distance of the points at which an edge is tested."""
 MAX_FACES = 400_000
-"""Of components with more faces only the bounding box is drawn."""
+"""Faces; of components with more only the bounding box is drawn."""
 
 
 def visible_lines(

@@ -15,30 +15,31 @@ _SIDES = (("front", -90.0), ("back", 90.0), ("left", 180.0), ("right", 0.0))
 
 
 MAX_ANGLE_DEG = 22.0
-"""Between a move and the direction by which it is called."""
+"""Largest angle between a move and the direction by which it is called."""
 MIN_PAIR_DEG = 40.0
-"""Between two directions into which a move is divided, and short of opposite ones."""
+"""Smallest angle between two directions into which a move is divided, and short of opposite ones."""
 MIN_REACH_MM = 5.0
 """Nearer targets give no direction."""
 MIN_LATERAL_SHARE = 0.5
-"""Of the distance of a target that lies across the direction away from the seat."""
+"""Share of the distance of a target that lies across the direction away from the seat."""
 FAR_COST = 0.25
-"""For each doubling of the distance beyond the nearest target."""
+"""Cost of each doubling of the distance beyond the nearest target."""
 MAX_FAR_COST = 1.0
+"""Largest cost of the distance of a target."""
 COMPONENT_COST = 0.1
-"""A component may be displaced itself; a datum feature is the reference."""
+"""Cost of a component as target, which may be displaced itself; a datum feature is the reference."""
 WRONG_COST = 0.6
-"""A component that is out of tolerance."""
+"""Cost of a component as target that is out of tolerance."""
 AWAY_COST = 0.6
-""""away from" is followed less surely than "towards", also the farther off."""
+"""Cost of "away from", which is followed less surely than "towards", also the farther off."""
 SIDE_COST = 1.8
-"""Sides of the part, where nothing better is there."""
+"""Cost of sides of the part, where nothing better is there."""
 PAIR_COST = 0.8
-"""Two moves instead of one."""
+"""Cost of two moves instead of one."""
 OBLIQUE_COST = 0.6
-"""Two directions that are 45° off the right angle."""
+"""Cost of two directions that are 45° off the right angle."""
 DETOUR_COST = 2.0
-"""For each length of the move that two steps take more than two at a right angle can."""
+"""Cost of each length of the move that two steps take more than two at a right angle can."""
 
 
 @dataclass(frozen=True)

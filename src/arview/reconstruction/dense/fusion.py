@@ -80,7 +80,7 @@ def fuse(
     threads: int,
     progress: Progress,
 ) -> DenseCloud:
-    """Fuse depth maps into the cloud of all points that ``options.min_views`` maps agree on.
+    """Fuse depth maps into the cloud of all points that ``MIN_VIEWS`` maps agree on.
 
     Args:
         maps: depth maps of the views.

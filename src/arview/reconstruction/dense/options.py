@@ -40,9 +40,5 @@ class DenseOptions:
             raise InputError(f"dense: best_sources {BEST_SOURCES} of sources {SOURCES}, expected 1 to 16 in this order")
         if not MIN_VIEWS >= 2:
             raise InputError(f"dense: min_views is {MIN_VIEWS}, expected at least 2")
-        for name in ("band_mm", "noise", "agreement_px", "max_sigma_px", "max_spread_px"):
-            if not getattr(self, name) > 0:
-                raise InputError(f"dense: {name} is {getattr(self, name)}, expected a positive number")
-        for name in ("normal_angle_deg", "grazing_deg"):
-            if not 0.0 < getattr(self, name) < 90.0:
-                raise InputError(f"dense: {name} is {getattr(self, name)}, expected between 0 and 90")
+        if not self.band_mm > 0:
+            raise InputError(f"dense: band_mm is {self.band_mm}, expected a positive number")

@@ -25,7 +25,7 @@ _COMPARED_TILES = (6, 8)  # rows and columns of the tiles in which these are com
 SAME_THUMBS = 0.95
 """Correlation above which two pictures are compared in detail."""
 SAME_SHIFT = 0.00125
-"""Of the longer side; pictures that differ by less than this shift show the same view."""
+"""Shift, as a share of the longer side; pictures that differ by less show the same view."""
 
 
 @dataclass(frozen=True)
@@ -134,7 +134,7 @@ def same_views(thumbnails: list[Pixels]) -> list[tuple[int, int]]:
     """Pairs (i < j) of pictures taken from the same place in the same direction, whatever their size and exposure.
 
     Candidates are found by correlation of tiny pictures. In every tile of a candidate pair the difference, after
-    fitting brightness and contrast, must be smaller than that of the picture to itself displaced by ``same_shift``.
+    fitting brightness and contrast, must be smaller than that of the picture to itself displaced by ``SAME_SHIFT``.
     """
     if len(thumbnails) < 2:
         return []

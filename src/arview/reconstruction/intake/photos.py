@@ -22,7 +22,7 @@ from arview.reconstruction.types import Photo
 BLURRED_PX = 2.0
 """Edge spread (Gaussian sigma) of a blurred photo; sharp ones have 0.3 to 1.2."""
 BLURRED_RATIO = 1.8
-"""The same relative to the median photo, to find one shaken photo among sharp ones."""
+"""Edge spread of a blurred photo relative to the median photo, to find one shaken photo among sharp ones."""
 BLURRED_MIN_PX = 1.3
 """A photo below this is sharp enough, even if it is worse than the others."""
 USELESS_PX = 3.5
@@ -34,7 +34,7 @@ MIN_TEXTURED = 0.02
 CLIPPED = 0.4
 """Share of white pixels of an overexposed photo; a white background gives 0.3."""
 CLIPPED_MORE = 0.2
-"""The same above the median photo's share."""
+"""Share of white pixels above the median photo's share from which a photo is overexposed."""
 DARK_LEVEL = 50.0
 """Grey level that 95 % of a dark photo's pixels do not exceed."""
 MIN_SIDE_PX = 320

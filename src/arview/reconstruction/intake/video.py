@@ -24,7 +24,7 @@ _MIN_TRACKED_SHARE = 0.3  # the same as a share of the corners found
 
 
 MIN_STEP = 0.025
-"""Of the diagonal between frames: about 6° around a part that fills a third of the picture."""
+"""Motion between frames, as a share of the diagonal: about 6° around a part that fills a third of the picture."""
 LOOKS_PER_S = 10.0
 """Frames examined per second; a hand-held camera hardly moves in a tenth of a second."""
 TRACKED_PX = 480

@@ -47,7 +47,7 @@ MIN_QUALITY = 0.1
 SIGHTINGS = 5
 """Maximum number of detections per photo."""
 SUBDIVISIONS = 3
-"""Of the guide views' directions; 3 is about 8° apart, enough for a start."""
+"""Subdivisions of the guide views' directions; 3 is about 8° apart, enough for a start."""
 SPANS = (0.2, 1.2)
 """Smallest and largest share of the photo's longer side that the part is expected to span."""
 MIN_SUPPORT = 0.25

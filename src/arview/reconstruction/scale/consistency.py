@@ -31,11 +31,12 @@ MAX_BEHIND = 0.15
 MIN_EDGES = 0.25
 """Smallest share of edges found beyond chance, in the median photo."""
 MIN_NEAR_IN_PART = 0.9
-"""Share of points near the surface by which a part is consistent that is mostly hidden. a part needs then."""
+"""Share of points near the surface from which a part that is mostly hidden is consistent, too."""
 CLEAR_EDGES = 0.6
 MIN_CLEAR = 2
+"""A part that is mostly hidden needs this many components of which a share of ``CLEAR_EDGES`` of the edges is found."""
 MIN_RELATIVE_EDGES = 0.45
-"""The same in one photo, relative to the median photo; a photo below does not fit."""
+"""Share of edges found in one photo, relative to the median photo; a photo below does not fit."""
 MAX_MISFITS = 0.1
 """Largest share of photos that do not fit."""
 

@@ -46,7 +46,7 @@ ROUGH_REACHES_PX: tuple[float, ...] = (12.0, 10.0, 7.0, 5.0)
 REACHES_PX: tuple[float, ...] = (7.0, 5.0, 3.5, 3.0, 3.0, 3.0)
 """Search range in each round from a near start."""
 SPACING_PX = 6.0
-"""Between samples along an edge, in px of the views."""
+"""Distance between samples along an edge, in px of the views."""
 DRAWN_WIDTH_PX = 800
 """Longer side at which hidden edges are determined."""
 HALF_WIDTH_PX = 3.0

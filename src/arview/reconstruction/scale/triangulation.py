@@ -29,7 +29,7 @@ MAX_SIGMAS = 4.0
 HUBER_SIGMAS = 1.5
 """Residual at which Huber's weights (1964) start to fall."""
 ITERATIONS = 8
-"""Of Gauss-Newton."""
+"""Iterations of Gauss-Newton."""
 
 
 @dataclass(frozen=True)

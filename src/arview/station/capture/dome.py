@@ -22,9 +22,9 @@ CELLS_PER_PHOTO = 1.8
 CELL_DEG = (8.0, 24.0)
 """Smallest and largest distance of neighbouring directions."""
 ELEVATION_DEG = (15.0, 75.0)
-"""Asked for where the part's range of views goes further."""
+"""Elevations that are asked for where the part's range of views goes further."""
 FILL = (1.06, 0.55)
-"""Part's diameter over the picture's shorter side: nearest, farthest."""
+"""The part's diameter over the picture's shorter side at the nearest and the farthest distance."""
 
 FITTING_FILL = 0.9
 """Share of the picture's shorter side that the part's diameter spans at the distance of a plan of photos."""

@@ -23,21 +23,22 @@ from arview.station.capture.options import CaptureOptions
 from arview.station.capture.trigger import FocusMonitor, Hysteresis, MotionMonitor, middle_of_part
 
 QUALITY = (0.5, 0.4)
-"""Of the tracked pose; wrong ones mostly do not reach 0.5."""
+"""Quality of the tracked pose needed to begin, and to go on; wrong poses mostly do not reach 0.5."""
 FOCUS_PX = 320
 """Side of the part of the picture in which sharpness is measured."""
 MIN_INSIDE = 0.8
 """Share of the part's bounding box that must be in the picture."""
 PENDING_S = 8.0
-"""After which a photo that was asked for and not reported counts as failed."""
+"""Time after which a photo that was asked for and not reported counts as failed."""
 DISTANCE_SLACK = 0.06
-"""Hysteresis of the distance."""
+"""Share by which the limits of the distance are wider once it was good."""
 GAIN_SHARE = 0.5
-"""Of the best direction's gain from which a photo is taken from another one …."""
+"""Share of the best direction's gain from which a photo is taken from another one …."""
 MIN_GAIN_SHARE = 0.1
 """… and the share accepted at the end of ``PATIENCE_S`` after the last photo."""
 PATIENCE_S = 6.0
-"""A person who does not go where it is best still gets photos."""
+"""Time after the last photo in which ``GAIN_SHARE`` falls to ``MIN_GAIN_SHARE``: a person who does not go where it is
+best still gets photos."""
 
 
 class CaptureGuide:

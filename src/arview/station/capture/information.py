@@ -34,13 +34,13 @@ COMMON_MM = 0.02
 PRIOR_MM = 5.0
 """Standard deviation of a place before any photo."""
 COVERAGE_FACTOR = 2.0
-"""K of the expanded uncertainty."""
+"""Coverage factor k of the expanded uncertainty."""
 MATCHED_DEG = 30.0
 """Angle to the second nearest photo up to which a photo counts in full …."""
 MATCH_FALL_DEG = 25.0
 """… and by how much more its weight falls to a third."""
 ALONE_WEIGHT = 0.1
-"""Of a photo that no two others can be matched with: its edges still count."""
+"""Weight of a photo that no two others can be matched with: its edges still count."""
 
 
 @dataclass(frozen=True)

@@ -32,11 +32,11 @@ from arview.station.capture.information import (
 from arview.station.capture.options import MAX_STEP_DEG, CaptureOptions
 
 APART_SHARE = 0.6
-"""Of the distance of two directions by which two photos differ at least."""
+"""Share of the distance of two directions by which two photos differ at least."""
 U_SHARE = 0.25
-"""Of the tolerance: a predicted U below it is enough."""
+"""Share of the tolerance; a predicted U below it is enough."""
 REACH_SHARE = 2.0
-"""Of the U that photos from all directions would give: below it is enough, too."""
+"""Multiple of the U that photos from all directions would give; a predicted U below it is enough, too."""
 
 
 class CaptureNeeds:

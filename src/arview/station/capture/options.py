@@ -22,7 +22,7 @@ class TriggerOptions:
 
 
 MAX_STEP_DEG = 40.0
-"""From the nearest photo: features of photos farther apart are not matched."""
+"""Largest angle from the nearest photo: features of photos farther apart are not matched."""
 
 
 @dataclass(frozen=True)

@@ -15,13 +15,14 @@ from arview.reconstruction.intake.checks import blur_and_texture
 from arview.station.capture.options import TriggerOptions
 
 GYRO_RAD_S = (0.12, 0.2)
-"""A hand that holds still trembles with about 0.05 rad/s."""
+"""Rotation rates below which a hand begins to hold still, and above which it no longer does; one that holds still
+trembles with about 0.05 rad/s."""
 WINDOW_S = 0.12
-"""Over which motion is measured: a tracker's noise is small beside it."""
+"""Time over which motion is measured: a tracker's noise is small beside it."""
 MAX_GAP_S = 0.8
-"""Between two frames; after a longer gap the motion is unknown."""
+"""Longest gap between two frames; after a longer one the motion is unknown."""
 FOCUS_MEMORY_S = 2.0
-"""Sharpness is compared with frames of this time."""
+"""Sharpness is compared with the frames of this time before."""
 MAX_BLUR_PX = 2.5
 """Edge spread of a frame that is out of focus …."""
 MAX_BLUR_RATIO = 1.6

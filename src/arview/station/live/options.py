@@ -14,9 +14,7 @@ MIN_SIDE_PX, MAX_SIDE_PX = 120, 1920
 
 
 UNDISTORT = UndistortOptions(max_growth=1.25, min_scale=0.3)
-
-
-# A wide lens: pictures are undistorted for the page, too, so they stay about as large as the frames.
+"""Of a wide lens: pictures are undistorted for the page, too, so they stay about as large as the frames."""
 
 
 @dataclass(frozen=True)

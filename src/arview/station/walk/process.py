@@ -19,7 +19,7 @@ from arview.station.walk.worker import WalkWorker
 from arview.workflow.lock import exclusive_access
 
 NICENESS = 5
-"""Of the process while the user waits …."""
+"""Niceness of the process while the user waits …."""
 
 
 def main(arguments: Sequence[str]) -> int:

@@ -33,12 +33,12 @@ MAX_RESIDUAL_PX = 2.0
 """Distance from the homography within which a corner or match counts as an inlier."""
 MIN_INLIERS = 15
 MIN_INLIER_SHARE = 0.5
-"""Of the corners that were followed, for a link from frame to frame."""
+"""Inliers, and their share of the corners that were followed, for a link from frame to frame."""
 MAX_FEATURES = 600
 """Features matched between two pictures where no chain of frames links them."""
 MIN_MATCH_INLIERS = 25
 MIN_MATCH_INLIER_SHARE = 0.4
-"""Of these matches."""
+"""Inliers, and their share of the matches, for a link between two pictures that no chain of frames links."""
 MAX_MATCH_RATIO = 0.8
 """Distance of the best match of a feature relative to that of the second best."""
 MAX_SCALE = 3.0

@@ -32,7 +32,7 @@ IS_USED = True
 QUALITY_RATE = 0.1
 """Share by which the usual quality of the followed specimen follows each frame, from 0."""
 SURE_QUALITY = 0.6
-"""Usual quality from which its pose is certainly right; below, the detector is asked."""
+"""Usual quality from which the pose of the followed specimen is certainly right; below, the detector is asked."""
 MIN_QUALITY = 0.5
 """Quality from which a pose counts as tracked."""
 MAX_JUMP = 0.35

@@ -18,13 +18,13 @@ FRAMES = 7
 MAX_BREAK = 3
 """Frames from one sure pose to the next up to which the motion between them is taken."""
 WRONG_FRAMES = 2
-"""The last of them whose poses may have been wrong."""
+"""Last frames before the gap whose poses may have been wrong."""
 MAX_GAP = 15
-"""Frames without a sure pose up to which it is continued."""
+"""Frames without a sure pose up to which the motion is continued."""
 NEAR = 0.2
 """Shift in diameters from the expected place, across the line of sight, up to which the part is there."""
 NEAR_DEPTH = 0.6
-"""The same along the line of sight."""
+"""Shift in diameters from the expected place, along the line of sight, up to which the part is there."""
 REACH = 0.6
 """Shift in diameters from the last place beyond which another specimen may stand."""
 MAX_TURN_DEG = 45.0

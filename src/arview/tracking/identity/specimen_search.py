@@ -20,7 +20,8 @@ TURN_DEG = 25.0
 """Angle by which a given pose is turned, where the camera may have gone round the part."""
 SAME_DEPTH = 0.6
 SAME_DEPTH_SHARE = 0.12
-"""The same along the line of sight, in diameters, and as a share of the distance; the larger limit counts."""
+"""Shift along the line of sight up to which a specimen is the same, in diameters, and as a share of the distance; the
+larger limit counts."""
 APART = 0.5
 """Shift in diameters from which a second detection is another specimen."""
 MAX_SPECIMENS = 3

@@ -36,9 +36,9 @@ RANGE_MARGIN = 0.1
 NEAR_VIEWS = 12
 """Views searched when only views near a known pose are wanted."""
 NEAR_DEG = 45.0
-"""Largest difference from the known pose in direction of view and in roll then."""
+"""Largest difference from the known pose in direction of view and in roll, when only views near it are wanted."""
 NEAR_STRETCH = 1.5
-"""Largest ratio to the known distance then."""
+"""Largest ratio to the known distance, when only views near a known pose are wanted."""
 WINDOWS = 18
 """Best windows of the first search that are examined at each distance."""
 VIEWS_PER_WINDOW = 4
@@ -52,11 +52,11 @@ PLACE_REACH = 0.3
 NEIGHBOUR_SEARCHES = 3
 """Best placements at which views from other directions are tried, too."""
 NEIGHBOUR_VIEWS = 6
-"""Views tried there."""
+"""Views from other directions that are tried at each of these placements."""
 NEIGHBOUR_DEG = 40.0
-"""Largest difference in direction of view of these views."""
+"""Largest difference in direction of view of the views from other directions."""
 MIN_SCORE = 0.55
-"""Correlation of a result."""
+"""Smallest correlation of a result."""
 MIN_SHARE = 0.8
 """Share of the best correlation that a result needs."""
 MAX_RESULTS = 2

@@ -38,9 +38,9 @@ LOG_FOCAL = 0
 SPREADS_PX: tuple[float, ...] = (6.0, 3.0, 1.5, 1.0, 0.7, 0.5)
 """Expected distance of predicted from true edges in each round; all edges are measured anew in each."""
 REACH = 12
-"""Samples to either side of an edge, of which ``STEP_PX`` is the distance."""
+"""Samples to either side of an edge."""
 STEP_PX = 1.0
-"""See ``REACH``."""
+"""Distance of the samples across an edge."""
 THRESHOLD = 3.0
 """Weakest step used, grey levels over two pixels."""
 UPDATES = 4
@@ -56,9 +56,9 @@ CORRELATED_POINTS = 8.0
 FOCAL_SIGMA = 0.5
 """Standard deviation of the logarithm of the focal length before the estimation."""
 CENTER_SIGMA = 0.01
-"""The same of the principal point, as a share of the picture's longer side."""
+"""Standard deviation of the principal point before the estimation, as a share of the picture's longer side."""
 K1_SIGMA = 0.05
-"""The same of the radial distortion."""
+"""Standard deviation of the radial distortion before the estimation."""
 MIN_POINTS = 40
 """Measured edge points that a frame must have."""
 SIGNIFICANCE = 5.0

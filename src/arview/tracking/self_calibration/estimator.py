@@ -23,9 +23,9 @@ NEW_FRAMES = 3
 MAX_STD = 0.05
 """Relative standard uncertainty above which the focal length counts as undetermined."""
 SURE_STD = 0.025
-"""Relative standard uncertainty above which ``MANY_FRAMES`` are needed as well."""
+"""Relative standard uncertainty above which ``MANY_FRAMES`` frames are needed as well."""
 MANY_FRAMES = 20
-"""See ``SURE_STD``."""
+"""Frames needed while the standard uncertainty is above ``SURE_STD``."""
 ENOUGH_STD = 0.006
 """Relative standard uncertainty at which more frames are not needed."""
 INFLATION = 1.5

@@ -18,7 +18,7 @@ from arview.station.live.stream.subject import Subject
 from arview.station.walk.job import JobFolder, jobs_in
 
 MAX_JOBS = 5000
-"""Of which the folder may hold so many."""
+"""Jobs that the folder may hold."""
 
 logger = logging.getLogger("arview.station.live")
 

@@ -34,14 +34,15 @@ from arview.station.walk.job import JobFolder
 from arview.station.walk.records import PhotoOrigin, checked_hint, checked_time
 
 MAX_PHOTOS = 400
-"""Of one inspection."""
+"""Photos of one inspection."""
 MAX_OPEN_UPLOADS = 64
-"""Begun and not complete, of one inspection."""
+"""Uploads of one inspection that are begun and not complete."""
 PHOTO_BYTES = 60_000_000
-"""Size of one photo."""
+"""Largest size of one photo, bytes."""
 PHOTO_PIXELS = 120_000_000
+"""Largest size of one photo, pixels."""
 QUOTA_BYTES = 200_000_000_000
-"""Size of the folder."""
+"""Largest size of the folder of all inspections, bytes."""
 UPLOAD_DAYS = 7.0
 """An upload that is not continued for so long is dropped."""
 

@@ -27,15 +27,15 @@ from arview.station.walk.job import JobFolder, start_worker
 from arview.station.walk.records import WalkState
 
 WORKER_PAUSES_S: tuple[float, ...] = (2.0, 10.0, 60.0)
-"""Before a measurement that broke is started again."""
+"""Pauses before a measurement that broke is started again; after the last one it has failed."""
 WORKER_STOP_S = 2.5
 """Time for a measurement to end in good order."""
 PATIENCE_S = 30.0
 """A measurement that only waits for photos makes room for others after so long."""
 IDLE_S = 900.0
-"""And ends after so long, until a photo comes."""
+"""A measurement that only waits for photos ends after so long, until a photo comes."""
 RECENT_S = 86400.0
-"""A walk of an earlier run that was not ended is continued if it is younger."""
+"""A walk of an earlier run that was not ended is continued if it is younger than this."""
 
 logger = logging.getLogger("arview.station.live")
 

@@ -30,10 +30,11 @@ _LEAF, _LEAF_KEY = "server.pem", "server.key"
 
 
 AUTHORITY_DAYS = 3650
+"""Days for which the authority is valid."""
 AUTHORITY_RENEWAL_DAYS = 120
 """The authority is replaced when fewer days are left."""
 SERVER_DAYS = 90
-"""Apple refuses server certificates that are valid for more than 825 days."""
+"""Days for which the server certificate is valid; Apple refuses more than 825."""
 SERVER_RENEWAL_DAYS = 30
 """The server certificate is renewed when fewer days are left."""
 

@@ -10,12 +10,13 @@ from arview.station.live.security.refusals import Refusal
 STRANGERS_OF_ADDRESS = 64
 """Connections of one address that have not shown the token; an idle one is 0.3 MB."""
 MAX_STRANGERS = 256
-"""Of all addresses."""
+"""Connections of all addresses that have not shown the token."""
 MAX_GUESTS = 256
 """Connections that have shown the token."""
 HANDSHAKES_PER_S = 30.0
-"""New connections of one address: about a tenth of a core at most."""
+"""New connections of one address per second: about a tenth of a core at most."""
 HANDSHAKES_BURST = 300.0
+"""New connections of one address at once."""
 
 Peer = tuple[str, int]
 """Address and port of the other end of a connection."""

@@ -47,11 +47,11 @@ _BROWSERS = (
 
 
 MAX_DEVICES = 64
-"""One more takes the place of the one that was not used for the longest time."""
+"""Paired devices; one more takes the place of the one that was not used for the longest time."""
 UNUSED_DAYS = 180.0
 """A device that is not used for so long is forgotten."""
 SAVE_INTERVAL_S = 600.0
-"""Times of last use are written at most so often."""
+"""Times of last use are written at most once in this time."""
 
 
 @dataclass(frozen=True)

@@ -37,10 +37,11 @@ from arview.station.live.stream.frames import DecodedFrame, IncomingFrame, from_
 from arview.station.live.transport.motion_jpeg import MotionJpeg
 
 JPEG_BYTES = 4_000_000
-"""Size of an uploaded frame."""
+"""Largest size of an uploaded frame."""
 OFFER_BYTES = 64_000
-"""Size of a join request with its WebRTC offer."""
+"""Largest size of a join request with its WebRTC offer."""
 CONTROL_BYTES = 4_000
+"""Largest size of a request that changes what a page shows."""
 WATCHERS = 4
 """Screens that only watch, as motion JPEG."""
 TRACKING_TIMEOUT_S = 10.0

@@ -42,11 +42,11 @@ from arview.station.walk.records import PhotoOrigin
 BODY_TIMEOUT_S = 10.0
 """Time in which a body must arrive."""
 PIECE_BYTES = 1 << 20
-"""Body of one request of an upload."""
+"""Largest body of one request of an upload."""
 PIECE_TIMEOUT_S = 60.0
-"""Time in which it must arrive; a slow network is no reason to start again."""
+"""Time in which the body of an upload must arrive; a slow network is no reason to start again."""
 TEXT_BYTES = 16_000
-"""Bodies of the other requests: hints, decisions."""
+"""Largest bodies of the other requests: hints, decisions."""
 
 T = TypeVar("T")
 

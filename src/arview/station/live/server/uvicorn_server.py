@@ -19,12 +19,13 @@ HANDSHAKE_TIMEOUT_S = 5.0
 CLOSING_TIMEOUT_S = 2.0
 """Time for the other end to answer the end of a TLS connection."""
 HEADERS_TIMEOUT_S = 10.0
-"""Time to send a whole request; later the connection is closed (Slowloris)."""
+"""Time to send the headers of a request; later the connection is closed (Slowloris)."""
 WRITE_TIMEOUT_S = 20.0
 """A client that accepts no data for so long is disconnected."""
 KEEP_ALIVE_S = 20
 """Time between two requests of a connection."""
 MAX_HEADER_BYTES = 16_384
+"""Largest size of the headers of a request."""
 
 
 class TimeLimitedProtocol(H11Protocol):

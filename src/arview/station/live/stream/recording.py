@@ -34,6 +34,7 @@ LOW_BYTES = 2_000_000_000
 STOP_TIMEOUT_S = 60.0
 """Time for the encoder to finish a file that a page stops."""
 MAX_DURATION_S = 3600.0
+"""Longest recording."""
 CHECK_INTERVAL_S = 5.0
 """Time between two checks of the free disk space."""
 

@@ -18,14 +18,17 @@ from arview.video import Frame, FrameSource, Image, open_source
 FIRST_PAUSE_S = 0.5
 """Pause before the first reconnection; it doubles with each further one."""
 MAX_PAUSE_S = 8.0
+"""Longest pause between two reconnections."""
 OPEN_TIMEOUT_S = 10.0
+"""Time in which a network camera must be opened."""
 READ_TIMEOUT_S = 3.0
+"""Time in which a network camera must deliver a frame."""
 STUCK_S = 30.0
 """A reader that neither delivers nor fails for so long is given up with its thread."""
 MAX_LOST = 8
 """Readers given up; then the camera counts as broken."""
 FROZEN_S = 2.0
-"""Pictures that stay equal, pixel for pixel, for so long: sensors have noise."""
+"""Pictures that stay equal, pixel for pixel, for so long are those of a frozen camera: sensors have noise."""
 SAMPLE_STEP_PX = 7
 """Distance of the pixels that are compared."""
 

@@ -16,7 +16,7 @@ from arview.station.live.stream.feed import Feed, TrackedFrame
 from arview.station.live.stream.subject import OverlayStyle
 
 WATCH_FPS = 15.0
-"""Frame rate of these: enough to watch, at half the encoding work."""
+"""Frame rate of screens that only watch: enough for them, at half the encoding work."""
 WATCH_TIMEOUT_S = 10.0
 """A screen that takes no picture for so long is disconnected."""
 WATCH_REPEAT_S = 2.0
