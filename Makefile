@@ -4,7 +4,7 @@ SHELL := /bin/bash
 READY := .venv/.ready
 DEMO_READY := .venv/.ready-demo
 SAMPLE := samples/plate
-# A worker for each core; each test file goes to one worker, in the order of tests/conftest.py.
+# A worker for each core; each test file goes to one worker, in the order of conftest.py.
 PARALLEL := -n auto --dist loadgroup --no-loadscope-reorder
 
 .PHONY: help demo demo-live test test-fast check docs guideviews bench evaluate soak screens clean
@@ -23,7 +23,7 @@ help:
 	@echo "make screens   photograph the live page in every state and look: out/screens"
 	@echo "make clean     remove what these targets made, except .venv"
 
-$(READY): pyproject.toml $(wildcard requirements.lock) tools/setup
+$(READY): pyproject.toml $(wildcard requirements.lock) tools/lab/pyproject.toml tools/setup
 	tools/setup
 	@touch $(DEMO_READY) $@
 

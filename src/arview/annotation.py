@@ -25,6 +25,11 @@ from arview.tracking.self_calibration.estimator import FocalEstimate
 from arview.tracking.self_calibration.session import SelfCalibratingSession
 from arview.video import Frame, FrameSource, Image
 
+MAX_FIRST_PASS = 900
+"""Frames of the first pass over a film at most."""
+MAX_IDLE_FRAMES = 240
+"""Frames without a new view after which the first pass ends."""
+
 QUEUED_FRAMES = 3
 """Frames that may wait between tracking and drawing; 19 MB at 1080p."""
 MAX_REASONS = 4
@@ -202,7 +207,6 @@ def estimate_camera(
         session: a new one; it is finished here.
         progress: called with the number of frames done.
     """
-    o = session.options
     kept = idle = 0
     for done, frame in enumerate(source, 1):
         session.process(frame.image, frame.index, frame.time_s)
@@ -212,7 +216,7 @@ def estimate_camera(
             progress(done)
         idle = 0 if session.frames > kept else idle + 1
         kept = session.frames
-        if session.is_done or done >= o.max_first_pass or idle >= o.max_idle_frames:
+        if session.is_done or done >= MAX_FIRST_PASS or idle >= MAX_IDLE_FRAMES:
             break
     return session.finish()
 

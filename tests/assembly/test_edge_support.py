@@ -10,10 +10,10 @@ import pytest
 from arview.assembly.observation import ComponentObserver, Observation, nothing_known
 from arview.assembly.visible_edges import VisibleEdgeCache
 from arview.cad import Model, ViewRange, make_model
-from arview.evaluation.semisynthetic.solids import box
 from arview.geometry import Array
 from arview.guideviews import GuideViewOptions, GuideViewSet
 from arview.guideviews.cache import cached_guide_views
+from arview_lab.semisynthetic.solids import box
 from helpers.synthetic import CAMERA, changed, component, picture, pose_from, post, wrong
 
 RANGE = ViewRange((420.0, 640.0), elevation_deg=(35.0, 60.0), azimuth_deg=(-40.0, 40.0), roll_deg=(-10.0, 10.0))

@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from arview.assembly.loss_memory import KnownBefore, LossMemory, LossMemoryOptions
+from arview.assembly.loss_memory import KnownBefore, LossMemory
 from arview.assembly.monitor import AssemblyMonitor
 from arview.assembly.turned_poses import Turn, TurnEvidence
 from arview.geometry import Array, exp_so3, rigid
@@ -97,7 +97,7 @@ def test_what_was_sure_before_the_loss_holds_again_when_the_part_was_found_turne
 def test_a_bare_base_is_found_as_it_lay_before_a_short_loss() -> None:
     turned, nothing = known_bare()._turned, TurnEvidence(np.zeros(len(NAMES)), 0.8)
     half = upright(monitor()).model_from_model
-    memory = LossMemory(LossMemoryOptions())
+    memory = LossMemory()
     memory.set_aside(KnownBefore(monitor()._state, frozenset(), frozenset(), True), POSE)
     best = turned.best(POSE @ half, lambda pose: nothing, lambda pose: memory.is_as_before(pose, 4))
     assert np.allclose(best, POSE, atol=1e-6)
@@ -114,7 +114,7 @@ def test_a_bare_base_is_found_as_it_lay_before_a_short_loss() -> None:
 
 
 def test_how_the_part_lay_is_unknown_without_a_pose_before_the_loss() -> None:
-    memory = LossMemory(LossMemoryOptions())
+    memory = LossMemory()
     known = KnownBefore(monitor()._state, frozenset({0}), frozenset({0, 1}), True)
     memory.set_aside(known, None)
     assert not memory.is_as_before(POSE, 1)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from arview.assembly.monitor import AssemblyMonitor, MonitorOptions
+from arview.assembly.monitor import AssemblyMonitor
 from arview.assembly.observation import Observation
 from arview.cad.model import Model
 from arview.geometry import Array, apply
@@ -18,7 +18,6 @@ from helpers.synthetic import CAMERA, assembly, assembly_views, block, path, pic
 from helpers.synthetic import changed as changed_from
 
 MOVED_MM = 20.0
-OPTIONS = MonitorOptions()
 
 
 @cache

@@ -14,7 +14,6 @@ from arview.assembly.presence_net import (
     GLOBALS,
     SIDE_PX,
     ComponentCrop,
-    ComponentCropOptions,
     PartImage,
     PresenceNet,
     component_crops,

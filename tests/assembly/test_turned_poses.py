@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from arview.assembly.direction_evidence import DirectionEvidence, DirectionOptions
+from arview.assembly.direction_evidence import DirectionEvidence
 from arview.assembly.monitor import AssemblyMonitor
 from arview.assembly.monitor_state import MonitorState
 from arview.assembly.turned_poses import Turn, TurnedPoses, TurnEvidence, base_turns
@@ -171,7 +171,7 @@ def test_what_is_known_of_a_place_stays_known_when_the_pose_is_turned() -> None:
     """Components 1 and 2 change places by half a turn; nothing of the shape of component 3 is where it goes."""
     half = rigid(exp_so3([0.0, 0.0, np.pi]), np.zeros(3))
     turn = Turn(half, np.array([0, 2, 1, -1]), is_exact=True)
-    directions = DirectionEvidence(4, np.zeros(3), DirectionOptions())
+    directions = DirectionEvidence(4, np.zeros(3))
     wrong_pose = pose_from(30, 40, 500)
     directions.add(wrong_pose, np.array([0.0, 5.0, -4.0, 6.0]), np.zeros(4, dtype=bool))
     before = MonitorState(

@@ -13,9 +13,9 @@ from typing import Any
 
 import pytest
 
-from arview.live.options import JobOptions
-from arview.live.server.loading import load_subjects
-from arview.live.stream.subject import Subject
+from arview.station.live.options import JobOptions
+from arview.station.live.server.loading import load_subjects
+from arview.station.live.stream.subject import Subject
 from helpers import live_browser
 from helpers.inspection_loop import COMPONENT, PLATE, Inspector, WalkSession, camera_script, first_walk, second_walk
 from helpers.live_client import running

@@ -10,9 +10,9 @@ from typing import Any
 
 import pytest
 
-from arview.capture import CaptureAdvice, ComponentNeed, capture_document, words
-from arview.live.server import clients
-from arview.live.stream import documents
+from arview.station.capture import CaptureAdvice, ComponentNeed, capture_document, words
+from arview.station.live.server import clients
+from arview.station.live.stream import documents
 from helpers import live_browser
 from helpers.live_client import Running, running
 from helpers.live_sample import INSPECTION, loader, options

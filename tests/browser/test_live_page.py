@@ -15,10 +15,10 @@ import pytest
 from PIL import Image as PilImage
 
 from arview.camera import Camera
-from arview.live.stream.stamp import Stamp, stamp_strip
-from arview.live.stream.subject import Subject
 from arview.overlay.guide import GUIDE_RGB
 from arview.pose import ComponentPresence, Identity, Presence, Visibility
+from arview.station.live.stream.stamp import Stamp, stamp_strip
+from arview.station.live.stream.subject import Subject
 from arview.video import VideoSink
 from helpers import live_browser
 from helpers.live_browser import closed, difference_mask, number_in, outline_errors_px, screenshot, true_mask
@@ -412,7 +412,7 @@ def test_screen_that_watches(chromium: Any, server: Running) -> None:
 
 
 def test_modules_agree_with_the_server(chromium: Any, server: Running) -> None:
-    """Stamp and camera model of the page agree with arview.live.stream.stamp and arview.camera."""
+    """Stamp and camera model of the page agree with arview.station.live.stream.stamp and arview.camera."""
     lens = live_browser.camera(WIDTH, HEIGHT)
     points = np.random.default_rng(1).uniform([-250, -140, 450], [250, 140, 650], (50, 3))
     fields = {key: getattr(lens, key) for key in ("width", "height", "fx", "fy", "cx", "cy")}

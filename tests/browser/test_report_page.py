@@ -93,7 +93,7 @@ def test_surfaces_that_no_two_photos_saw_are_hatched(chromium: Any, tmp_path: Pa
     from arview.geometry import look_at
     from arview.reconstruction.types import PosedPhoto, SparseModel
     from arview.report.evidence import gather
-    from arview.report.page import ReportOptions, build_context, render
+    from arview.report.page import build_context, render
 
     part = load_part(str(PART))
     middle, diameter = part.model.center_in_model, part.model.diameter_mm
@@ -105,10 +105,10 @@ def test_surfaces_that_no_two_photos_saw_are_hatched(chromium: Any, tmp_path: Pa
     sparse = SparseModel(photos, none, none.astype(np.uint8), np.zeros(0), ints, ints, np.zeros((0, 2)))
     quiet: Progress = lambda what, done, total: None  # noqa: E731
     evidence = gather(INSPECTION, part)
-    context = build_context(evidence, ReportOptions(), quiet)
+    context = build_context(evidence, quiet)
     from arview.report.page import _viewer
 
-    context |= _viewer(replace(evidence, sparse=sparse), ReportOptions())
+    context |= _viewer(replace(evidence, sparse=sparse))
     path = tmp_path / "report.html"
     path.write_text(render(context, for_print=False), encoding="utf-8")
     page, said = opened(chromium, path)

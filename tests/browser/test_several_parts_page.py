@@ -13,8 +13,8 @@ import pytest
 
 from arview.camera import Camera
 from arview.camera.read import save_camera
-from arview.live.stream.subjects import Subjects
 from arview.pose import ComponentPresence, Identity, Pose, Presence, TrackingState, Visibility
+from arview.station.live.stream.subjects import Subjects
 from arview.video import Image, VideoSink
 from helpers import live_browser, two_specimens
 from helpers.live_client import Running, running

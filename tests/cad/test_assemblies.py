@@ -13,11 +13,11 @@ from click.testing import CliRunner
 
 from arview.cad.assembly_tree import MAX_LINES, tree_lines
 from arview.cad.check import GATHERED_ROWS, check_part
-from arview.cad.equal_shapes import ShapeSearchOptions, ShapeSymmetries
+from arview.cad.equal_shapes import ShapeSymmetries
 from arview.cad.model import Component, make_model
 from arview.cad.part import ComponentSettings, Part
 from arview.cad.part_file import load_part
-from arview.cad.tolerance_check import ToleranceCheckOptions, tolerance_remarks
+from arview.cad.tolerance_check import tolerance_remarks
 from arview.cli import main
 from helpers.cad_files import box, glb_with_boxes
 

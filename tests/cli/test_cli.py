@@ -19,7 +19,6 @@ import pytest
 import trimesh
 from click.testing import CliRunner, Result
 
-import arview.evaluation.run
 import arview.guideviews.cache
 import arview.tracking
 from arview.cad import load_part
@@ -29,7 +28,6 @@ from arview.geometry import look_at
 from arview.inspection import Inspection, Provenance, save_inspection
 from arview.pose import Pose, TrackingState
 from arview.version import __version__
-from helpers.bop_scene import write_scene
 from helpers.cad_files import box
 from helpers.fake_session import POSE, FakeSession
 from helpers.paths import TESTS
@@ -85,7 +83,6 @@ def room(tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     # Guide views are kept away from the user's; compiled kernels stay where they are found.
     monkeypatch.setattr(arview.guideviews.cache, "cache_folder", lambda: cache)
     monkeypatch.setattr(arview.tracking, "TrackingSession", FakeSession)
-    monkeypatch.setattr(arview.evaluation.run, "TrackingSession", FakeSession)
     return tmp_path
 
 
@@ -245,22 +242,6 @@ def test_check_prints_the_part_and_its_help_a_part_file(room: Path) -> None:
     assert "[view_range]" in run("check", "--help").stdout
 
 
-def test_evaluate_prints_errors_and_writes_them(room: Path) -> None:
-    write_scene(room / "set" / "brick")
-    arguments = ("evaluate", "set/brick", "--json", "out.json", "--renderer", "zbuffer", "--per-frame")
-    result = run(*arguments)
-    assert result.exit_code == 0, result.output
-    # The session stays where it began and the truth moves 1 mm a frame.
-    assert "3 frames (3 tracked), 3 evaluated" in result.stdout
-    (scene,) = json.loads((room / "out.json").read_text())["scenes"]
-    assert [frame["error"]["translation_mm"] for frame in scene["frames"]] == pytest.approx([0, 1, 2], abs=1e-9)
-    assert scene["summary"]["errors"]["translation_mm"]["max"] == pytest.approx(2.0)
-    result = run("evaluate", "set/brick", "--init", "guide:middle", "--renderer", "zbuffer")
-    assert result.exit_code == 0, result.output
-    assert "from guide:middle" in result.stdout
-    refused(run("evaluate", "set/brick", "--init", "guide:nowhere", "--renderer", "zbuffer"), "nowhere", "middle")
-
-
 # --- Bad input ------------------------------------------------------------------------------------------
 
 
@@ -359,7 +340,6 @@ def test_outputs_that_cannot_be(room: Path) -> None:
     refused(run("annotate", "clip.mp4", *ANNOTATE, "-o", "out.avi"), ".mp4")
     refused(run("guideviews", "part.toml", "-o", "camera.json/set.bin"), "no folder")
     refused(run("guideviews", "part.toml", "-o", "set.bin", "--preview", "sheet.bmp"), ".png")
-    refused(run("evaluate", "none", "--json", "x.json"), "no such folder")
 
 
 def test_inputs_are_never_overwritten(room: Path) -> None:

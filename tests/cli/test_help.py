@@ -23,8 +23,12 @@ EXAMPLE = re.compile(r"^ +(?:\.venv/bin/)?arview ((?:[^#\n]|(?<=\S)#)*)", re.MUL
 
 
 def commands(group: click.Group = main, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], click.Command]]:
+    """The program and all its commands, those of `tools/lab` included where it is installed."""
     yield path, group
-    for name, command in group.commands.items():
+    context = click.Context(group)
+    for name in group.list_commands(context):
+        command = group.get_command(context, name)
+        assert command is not None
         if isinstance(command, click.Group):
             yield from commands(command, (*path, name))
         else:

@@ -21,12 +21,12 @@ from arview.detection.search.template_matching import (
     match_templates,
     visible_score,
 )
-from arview.evaluation.semisynthetic import SequenceOptions, render_sequence, shape
-from arview.evaluation.semisynthetic.real_sequence import share_in_view
 from arview.geometry import Array, apply, exp_so3, rigid
 from arview.guideviews import GuideViewOptions
 from arview.guideviews.cache import cached_guide_views
 from arview.video import Image
+from arview_lab.semisynthetic import SequenceOptions, render_sequence, shape
+from arview_lab.semisynthetic.real_sequence import share_in_view
 from helpers.synthetic import background, error
 
 PAD_PX, SIDE_PX, RADIUS_PX, STEP_PX = 12, 64, 20.0, 4

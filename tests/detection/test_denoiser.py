@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from arview.detection.features.denoiser import Denoiser, DenoiserOptions, noise_level
+from arview.detection.features.denoiser import Denoiser, noise_level
 from arview.detection.search.local_search import LocalSearch
 from helpers.synthetic import CAMERA, assembly_views, background, pose_from
 from helpers.synthetic import picture as drawn

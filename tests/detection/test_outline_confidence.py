@@ -6,14 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from arview.detection.confidence import (
-    CONFIDENCE,
-    ConfidenceTerms,
-    Margins,
-    confidence_terms,
-    outline_score,
-    pose_probability,
-)
+from arview.detection.confidence import ConfidenceTerms, Margins, confidence_terms, outline_score, pose_probability
 from arview.refinement.evidence import PoseEvidence
 
 CLEAR = PoseEvidence(

@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 
 from arview.cad import Model, make_model
 from arview.cad.view_range import ViewRange
-from arview.detection.disambiguation import DisambiguationOptions
 from arview.detection.features.edge_net import EdgeNet
 from arview.detection.features.image_pyramid import ImagePyramid
 from arview.detection.scoring.pair_comparator import PairComparator

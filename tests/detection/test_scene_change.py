@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from arview.cad.view_range import ViewRange
-from arview.detection.scene_change import SceneChange, SceneChangeOptions
+from arview.detection.scene_change import SceneChange
 from arview.guideviews import GuideViewOptions, make_guide_views
 from helpers.synthetic import CAMERA, RANGE, assembly, assembly_views, picture, pose_from
 

@@ -16,7 +16,6 @@ from arview.camera.read import guess_camera
 from arview.detection import Detector
 from arview.detection.detector import DetectorOptions
 from arview.detection.search.global_search import GlobalSearch
-from arview.evaluation.semisynthetic import SequenceOptions, render_sequence, shape
 from arview.geometry import Array, apply, exp_so3, rigid
 from arview.guideviews import GuideViewOptions, GuideViewSet
 from arview.guideviews.cache import cached_guide_views
@@ -24,6 +23,7 @@ from arview.refinement.kernels import nearest_view
 from arview.refinement.view_model import PartView
 from arview.rendering.renderers import ZBufferRenderer
 from arview.video import Image
+from arview_lab.semisynthetic import SequenceOptions, render_sequence, shape
 from helpers.synthetic import background, error
 
 CAMERA = guess_camera(640, 480)

@@ -18,13 +18,13 @@ from aiortc import RTCConfiguration, RTCPeerConnection, RTCSessionDescription
 from aiortc.mediastreams import MediaStreamTrack
 from av.video.frame import VideoFrame
 
-from arview.live.options import LiveOptions
-from arview.live.security.addresses import LOOPBACK
-from arview.live.server.hub import Hub
-from arview.live.server.live_server import LiveServer, open_endpoint
-from arview.live.stream.stamp import read_stamp, stamped
-from arview.live.stream.subjects import Subjects
-from arview.live.transport.receiving import reduce_latency, restrict_candidates
+from arview.station.live.options import LiveOptions
+from arview.station.live.security.addresses import LOOPBACK
+from arview.station.live.server.hub import Hub
+from arview.station.live.server.live_server import LiveServer, open_endpoint
+from arview.station.live.stream.stamp import read_stamp, stamped
+from arview.station.live.stream.subjects import Subjects
+from arview.station.live.transport.receiving import reduce_latency, restrict_candidates
 from arview.video import Image
 
 

@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from arview.live.options import JobOptions
-from arview.live.stream.frames import to_jpeg
-from arview.workflow.walk.job import JobFolder
-from arview.workflow.walk.records import WalkState
+from arview.station.live.options import JobOptions
+from arview.station.live.stream.frames import to_jpeg
+from arview.station.walk.job import JobFolder
+from arview.station.walk.records import WalkState
 from helpers.live_client import Http
 from helpers.live_sample import INSPECTION
 

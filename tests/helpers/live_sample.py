@@ -11,9 +11,9 @@ import cv2
 import numpy as np
 
 from arview.geometry import Array
-from arview.live.options import ConnectionLimits, LiveOptions, RequestLimits, WebrtcOptions
-from arview.live.server.loading import load_subjects
-from arview.live.stream.subjects import Subjects
+from arview.station.live.options import LiveOptions, RequestLimits
+from arview.station.live.server.loading import load_subjects
+from arview.station.live.stream.subjects import Subjects
 from arview.video import Image, open_source
 from helpers.paths import SAMPLES
 

@@ -19,13 +19,21 @@ def source_files() -> tuple[Path, ...]:
 
 
 @cache
+def lab_files() -> tuple[Path, ...]:
+    """Every Python file of the laboratory, a package of its own."""
+    return tuple(sorted((TOOLS / "lab" / "arview_lab").rglob("*.py")))
+
+
+@cache
 def tool_files() -> tuple[Path, ...]:
-    """Every Python file of ``tools/``, those without a suffix included."""
+    """Every Python file of ``tools/`` but tests, those without a suffix included."""
     return tuple(
         sorted(
             path
             for path in TOOLS.rglob("*")
-            if path.is_file() and "__pycache__" not in path.parts and (path.suffix == ".py" or _is_script(path))
+            if path.is_file()
+            and not {"__pycache__", "tests"} & set(path.relative_to(TOOLS).parts)
+            and (path.suffix == ".py" or _is_script(path))
         )
     )
 

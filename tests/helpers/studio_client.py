@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from arview.cad import load_part
-from arview.studio.document import StudioDocument
-from arview.studio.server import StudioServer
+from arview.station.studio.document import StudioDocument
+from arview.station.studio.server import StudioServer
 from helpers.live_client import Http
 
 

@@ -17,8 +17,8 @@ from unittest import mock
 import cv2
 import numpy as np
 
-from arview.live.stream.subjects import Subjects
 from arview.pose import ComponentPresence, Pose, Presence, TrackingState, Visibility
+from arview.station.live.stream.subjects import Subjects
 from arview.video import Image, VideoSink
 from helpers import live_browser
 from helpers.live_client import Running, running

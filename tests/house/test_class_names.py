@@ -1,11 +1,11 @@
-"""One name for one thing: no two classes of the package share a name, and no alias has the name of a class."""
+"""One name for one thing: no two classes share a name, and no alias has the name of a class; `tools/lab` included."""
 
 from __future__ import annotations
 
 import ast
 from collections import defaultdict
 
-from helpers.source_tree import label, source_files, tree
+from helpers.source_tree import lab_files, label, source_files, tree
 
 SHARED: frozenset[str] = frozenset()
 """Names that several classes may have, because each is private to its file."""
@@ -13,7 +13,7 @@ SHARED: frozenset[str] = frozenset()
 
 def test_no_two_classes_share_a_name() -> None:
     classes, aliases = defaultdict(list), defaultdict(list)
-    for path in source_files():
+    for path in [*source_files(), *lab_files()]:
         for node in ast.walk(tree(path)):
             if isinstance(node, ast.ClassDef):
                 classes[node.name].append(label(path))

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from helpers.source_tree import imports, modules
+import ast
+from pathlib import Path
+
+from helpers.source_tree import imports, lab_files, modules, source_files, tree
 
 ROOMS = (
     ("errors",),
@@ -23,13 +26,14 @@ ROOMS = (
     ("pose_file",),
     ("annotation",),
     ("reconstruction",),
-    ("capture",),
     ("measurement",),
-    ("rework", "decisions"),
-    ("report", "history", "calibration", "acceptance", "evaluation"),
+    ("quality.rework", "quality.decisions"),
+    ("report", "quality.history", "calibration", "acceptance"),
     ("workflow",),
-    ("live",),
-    ("studio",),
+    ("quality.batch", "station.capture"),
+    ("station.walk",),
+    ("station.live",),
+    ("station.studio",),
     ("cli",),
 )
 """From the bottom up. A room imports only rooms of lines above its own; rooms on one line do not import each other."""
@@ -38,12 +42,18 @@ FORBIDDEN = {
     "measurement": {"detection", "refinement", "tracking"},
     "detection": {"assembly"},
 }
-FRONT = {"arview", "arview.__main__"}
-"""The front door, which is of no room and may name all of them."""
+FRONT = {"arview", "arview.__main__", "arview.station", "arview.quality"}
+"""The front door and those of the wings, which are of no room."""
+
+
+WINGS = {"arview.station", "arview.quality"}
+"""Packages of rooms. They hold no code themselves."""
 
 
 def room(name: str) -> str:
-    return name.split(".")[1]
+    """The room of a module: the folder or module below `arview`, in a wing the one below the wing."""
+    parts = name.split(".")
+    return ".".join(parts[1 : 3 if ".".join(parts[:2]) in WINGS else 2])
 
 
 def test_every_module_is_in_a_room_of_the_table() -> None:
@@ -72,6 +82,19 @@ def test_rooms_that_know_nothing_of_each_other() -> None:
     for name in modules():
         if name not in FRONT:
             assert not {room(other) for other in imports(name)} & FORBIDDEN.get(room(name), set()), name
+
+
+def test_the_program_knows_nothing_of_the_laboratory() -> None:
+    def knows(path: Path) -> bool:
+        return any(
+            name.split(".")[0] == "arview_lab"
+            for node in ast.walk(tree(path))
+            if isinstance(node, ast.Import | ast.ImportFrom)
+            for name in ([alias.name for alias in node.names] if isinstance(node, ast.Import) else [node.module or ""])
+        )
+
+    assert sum(map(knows, lab_files())) > 20
+    assert [path.name for path in source_files() if knows(path)] == []
 
 
 def test_there_is_no_circle() -> None:

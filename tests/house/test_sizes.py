@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 
-from helpers.source_tree import functions, label, source_files
+from helpers.source_tree import functions, lab_files, label, source_files
 
 MAX_FILE_LINES = 500
 MAX_FUNCTION_LINES = 80
@@ -15,7 +15,8 @@ EXCEPTIONS: dict[str, str] = {}
 
 def too_large() -> set[str]:
     found = set()
-    for path in source_files():
+    files = [*source_files(), *lab_files()]
+    for path in files:
         if len(path.read_text(encoding="utf-8").splitlines()) > MAX_FILE_LINES:
             found.add(label(path))
         for name, node in functions(path):
@@ -23,7 +24,7 @@ def too_large() -> set[str]:
             # Without decorators, with the signature and the docstring.
             if node.end_lineno - node.lineno + 1 > MAX_FUNCTION_LINES:
                 found.add(f"{label(path)}:{name}")
-    folders = Counter(path.parent for path in source_files() if path.name != "__init__.py")
+    folders = Counter(path.parent for path in files if path.name != "__init__.py")
     return found | {f"{label(folder)}/" for folder, count in folders.items() if count > MAX_FOLDER_FILES}
 
 

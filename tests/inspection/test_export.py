@@ -19,13 +19,13 @@ from arview.cad.model import Model
 from arview.cli import main
 from arview.cli.exit_codes import ExitCode, exit_code_of
 from arview.errors import InputError, MismatchError
-from arview.history import HistoryStore
 from arview.inspection import Inspection, Verdict, load_inspection, save_inspection
 from arview.inspection.export import to_csv, to_dfq, to_glb, to_qif
 from arview.inspection.fingerprint import fingerprint, fingerprint_of_file
 from arview.inspection.rounding import decimals_beside_limit, decimals_of, exact, fixed
 from arview.inspection.schema_doc import schema_markdown
 from arview.inspection.summary import overall_verdict, verdict_sentence
+from arview.quality.history import HistoryStore
 from arview.report.evidence import gather
 from helpers.inspections import bench_inspection, deviation, inspection, not_measured
 from helpers.paths import ROOT, SHARED

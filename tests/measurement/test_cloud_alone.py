@@ -15,7 +15,7 @@ from arview.cli import ExitCode, main
 from arview.errors import InputError
 from arview.geometry import Array, apply, exp_so3, invert, rigid
 from arview.inspection import Inspection, load_inspection
-from arview.measurement.cloud.global_registration import GlobalRegistrationOptions, find_model_in_cloud
+from arview.measurement.cloud.global_registration import find_model_in_cloud
 from arview.measurement.cloud.mesh_surface import MeshSurface
 from arview.measurement.datums.in_cloud import measure_datums_in_cloud
 from arview.measurement.folder import in_model_frame, read_cloud
@@ -61,7 +61,7 @@ def test_the_part_is_found_and_not_half_a_turn_round(has_normals: bool) -> None:
     """The plate is symmetric, the blocks differ by millimetres, one is missing, and two stand elsewhere."""
     cloud = scan(as_built())
     cloud = cloud if has_normals else replace(cloud, normals=np.zeros_like(cloud.normals))
-    found = find_model_in_cloud(cloud, nominal(), options=QUICK)
+    found = find_model_in_cloud(cloud, nominal())
     assert found.scale == 1.0
     assert off_mm(found.model_from_scan) < 0.3
 
@@ -69,7 +69,7 @@ def test_the_part_is_found_and_not_half_a_turn_round(has_normals: bool) -> None:
 @pytest.mark.slow
 def test_the_scale_is_found_too() -> None:
     cloud = scan(as_built(), scale=37.0)
-    found = find_model_in_cloud(cloud, nominal(), None, replace(QUICK, scale_range=(0.85, 1.2)))
+    found = find_model_in_cloud(cloud, nominal(), None)
     assert found.scale == pytest.approx(37.0, rel=1e-3)
     assert off_mm(found.model_from_scan, found.scale, 37.0) < 0.4
 
@@ -79,13 +79,13 @@ def test_clouds_of_nothing_that_is_known() -> None:
     cloud = scan(as_built())
     mirror = np.array([-1.0, 1.0, 1.0])
     with pytest.raises(InputError, match="20 points are too few"):
-        find_model_in_cloud(DenseCloud(*(a[:20] for a in vars(cloud).values())), nominal(), options=QUICK)
+        find_model_in_cloud(DenseCloud(*(a[:20] for a in vars(cloud).values())), nominal())
     rng = np.random.default_rng(3)
     ball = rng.normal(size=(20_000, 3))
     ball = 90.0 * ball / np.linalg.norm(ball, axis=1, keepdims=True)
     other = replace(cloud, points=ball, normals=(ball / 90.0).astype(np.float32))
     with pytest.raises(InputError, match=r"cloud: the part (was not found|fits in two ways)"):
-        find_model_in_cloud(other, nominal(), options=QUICK)
+        find_model_in_cloud(other, nominal())
     # A lug at one end of a block tells left from right.
     parts = (*nominal().components, Component("lug", *with_faces(box((-20, 70, 0), (30, 85, 35)))))
     handed = make_model("handed", parts)

@@ -9,8 +9,8 @@ import pytest
 
 from arview.errors import InputError
 from arview.geometry import Array
-from arview.measurement.cloud.placing import ThinningOptions, cloud_in_mm
-from arview.measurement.cloud.reading import RawPoints, ReadOptions, possible_units, read_points, unit_of_option
+from arview.measurement.cloud.placing import cloud_in_mm
+from arview.measurement.cloud.reading import RawPoints, possible_units, read_points, unit_of_option
 from arview.measurement.folder import read_cloud
 from helpers.plate_scene import nominal
 

@@ -14,13 +14,7 @@ from arview.errors import InputError
 from arview.geometry import Array
 from arview.measurement.datums.alignment import Alignment, align
 from arview.measurement.datums.datum_fit import correlation_factor, robust_weights
-from arview.measurement.datums.equations import (
-    AlignmentOptions,
-    DatumEquations,
-    move_equations,
-    point_from_move,
-    surface_equations,
-)
+from arview.measurement.datums.equations import DatumEquations, move_equations, point_from_move, surface_equations
 from arview.measurement.datums.in_photos import measure_datums_in_photos
 from arview.measurement.photo import measure_components_in_photos
 from arview.measurement.photo.views import views_of

@@ -31,7 +31,7 @@ def test_rare_points_are_preferred_in_every_part_of_a_list() -> None:
     rng = np.random.default_rng(2)
     is_rare = np.arange(2000) < 1000
     cloud = scene(2000, np.where(is_rare, 1.0, 0.02), rng)
-    lists = _near_lists(cloud, 1000.0, PairRegistrationOptions(), rng)
+    lists = _near_lists(cloud, 1000.0, rng)
     assert (lists >= 0).all()
     # 640 of 1000 rare and 1000 common points at odds of 50 to 1: about 620 are rare.
     assert 0.95 < is_rare[lists].mean() < 0.99

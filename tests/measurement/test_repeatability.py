@@ -21,7 +21,7 @@ from arview.measurement.folder import MetricReconstruction
 from arview.measurement.options import MeasureOptions
 from arview.measurement.repeatability import BUDGET_LINE, compare, measure_halves, with_repeatability
 from arview.measurement.seen_from import SeenFrom, is_mostly_hidden, seen_from, with_hidden, with_seen_from
-from arview.reconstruction.coverage import ComponentCoverage, CoverageOptions
+from arview.reconstruction.coverage import ComponentCoverage
 from arview.reconstruction.scale.types import Consistency, ScaleEvidence, ScaleResult
 from arview.reconstruction.types import PosedPhoto, SparseModel
 from arview.report.halves import repeatability_context
@@ -92,13 +92,13 @@ def test_what_agrees_is_left_as_it_is(tmp_path: Path) -> None:
 
 def test_a_component_seen_from_too_few_sides_says_so() -> None:
     one = measured((0.1, 0.0, 0.0))
-    seen = SeenFrom({"block": ComponentCoverage("block", (3, 4), 1, 12.0, 300.0)}, CoverageOptions())
+    seen = SeenFrom({"block": ComponentCoverage("block", (3, 4), 1, 12.0, 300.0)})
     found = with_seen_from(one, seen).details
     assert found is not None and found.photos == 2
     assert found.notes[-1] == (
         "only 2 photos from 1 direction show it, at most 12° apart, so its U is wide; take more from other sides"
     )
-    many = SeenFrom({"block": ComponentCoverage("block", tuple(range(9)), 5, 80.0, 90.0)}, CoverageOptions())
+    many = SeenFrom({"block": ComponentCoverage("block", tuple(range(9)), 5, 80.0, 90.0)})
     kept = with_seen_from(one, many).details
     assert kept is not None and one.details is not None and kept.photos == 9 and kept.notes == one.details.notes
 

@@ -206,10 +206,10 @@ def test_without_datums_the_base_is_the_frame(reconstruction: MetricReconstructi
 def test_a_datum_that_is_not_there(reconstruction: MetricReconstruction) -> None:
     filled = replace(part(), datums=(*part().datums[:2], replace(part().datums[2], point_in_model=(0.0, 40.0, 0.0))))
     with pytest.raises(InputError, match="datum C: 'plate' has no hole of ⌀16 mm about"):
-        run.align_to_datums(reconstruction, _views(reconstruction), filled, ["plate"], {}, MeasureOptions())
+        run.align_to_datums(reconstruction, _views(reconstruction), filled, ["plate"], {})
     covered = replace(part(), datums=(replace(part().datums[0], point_in_model=(0.0, 0.0, 3.0)),))
     with pytest.raises(InputError, match="datum A: 'plate' has no flat face"):
-        run.align_to_datums(reconstruction, _views(reconstruction), covered, ["plate"], {}, MeasureOptions())
+        run.align_to_datums(reconstruction, _views(reconstruction), covered, ["plate"], {})
 
 
 def _views(reconstruction: MetricReconstruction) -> Any:

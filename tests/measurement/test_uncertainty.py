@@ -270,13 +270,13 @@ def test_large_turns_of_frame_and_component() -> None:
 
 def test_near_zero_the_bias_is_seen() -> None:
     c = np.eye(3) * 0.03**2
-    zero = length_of(np.array([0.03, 0.03, 0.02]), c, None, 3, BARE)
+    zero = length_of(np.array([0.03, 0.03, 0.02]), c, None, 3)
     assert zero.corrected == 0.0 and zero.bias == pytest.approx(zero.value)
     assert zero.low == 0.0
     assert zero.uncertainty == pytest.approx(2 * 0.03)
-    longest = length_of(np.array([0.0, 0.0, 0.0838]), c, None, 3, BARE)  # 95 % of Maxwell's distribution is 2.795 σ
+    longest = length_of(np.array([0.0, 0.0, 0.0838]), c, None, 3)  # 95 % of Maxwell's distribution is 2.795 σ
     assert longest.uncertainty == pytest.approx(longest.value) and longest.low == 0.0
-    far = length_of(np.array([1.0, 0.0, 0.0]), c, None, 3, BARE)
+    far = length_of(np.array([1.0, 0.0, 0.0]), c, None, 3)
     assert far.k == pytest.approx(2.0, abs=0.05)
     assert far.bias == pytest.approx(0.03**2, rel=0.05)
     assert quantile_of_length(np.diag([0.09, 0.0, 0.0])) == pytest.approx(0.3 * 1.96, rel=0.01)
@@ -293,7 +293,7 @@ def test_intervals_hold_lengths_near_zero(sigmas: tuple[float, float, float], le
     for _ in range(1000):
         direction = rng.normal(size=3) * (std > 0)
         seen = length * direction / np.linalg.norm(direction) + rng.normal(size=3) * std
-        found = length_of(seen, np.diag(std**2), draws, axes, BARE)
+        found = length_of(seen, np.diag(std**2), draws, axes)
         held.append(found.low <= length <= found.high)
         wide.append(found.uncertainty)
     # Four standard deviations of a binomial distribution are 2.8 %; along the lesser axes U is of the largest.

@@ -204,23 +204,21 @@ def test_colours_show_the_verdict() -> None:
 
 
 def test_label_texts_come_from_the_inspection() -> None:
-    options = OverlayOptions()
     failed = deviation("post_3", (1.0, -0.61, 0.05), "fail")
-    assert labels.value_text(failed, options) == "1.17 mm"
-    assert labels.detail_text(failed, options) == "dx +1.00  dy −0.61   U 0.12"
+    assert labels.value_text(failed) == "1.17 mm"
+    assert labels.detail_text(failed) == "dx +1.00  dy −0.61   U 0.12"
     blind = ComponentDeviation(
         "a", (0.3, 0.4, None), 0.5, (True,) * 5 + (False,), 0.1, 0.4, Verdict.FAIL, tilt_deg=1.25
     )
-    assert labels.detail_text(blind, options) == "dx +0.30  dy +0.40  dz ?   tilt 1.2°   U 0.10"
+    assert labels.detail_text(blind) == "dx +0.30  dy +0.40  dz ?   tilt 1.2°   U 0.10"
     missing = ComponentDeviation(
         "a", (None,) * 3, None, (False,) * 6, None, None, Verdict.FAIL, finding=Finding.MISSING
     )
-    assert (labels.value_text(missing, options), labels.detail_text(missing, options)) == ("missing", "")
+    assert (labels.value_text(missing), labels.detail_text(missing)) == ("missing", "")
     rough = replace(failed, uncertainty_mm=2.34)
-    assert labels.value_text(rough, options) == "1.2 mm"  # no more decimals than U allows
-    assert labels.detail_text(rough, options) == "U 2.3"
-    inch = OverlayOptions(unit="inch", decimals=3)
-    assert labels.value_text(deviation("a", (0.0, 25.4, 0.0), "fail"), inch) == "1.000 in"
+    assert labels.value_text(rough) == "1.2 mm"  # no more decimals than U allows
+    assert labels.detail_text(rough) == "U 2.3"
+    assert labels.value_text(deviation("a", (0.0, 25.4, 0.0), "fail")) == "1.000 in"
 
 
 def test_failures_come_first(plate: Model, record: Inspection) -> None:

@@ -13,11 +13,11 @@ from scipy.spatial import cKDTree
 from arview.cad.model import Component, Model, make_model
 from arview.camera import Camera
 from arview.errors import InputError
-from arview.evaluation.clouds import distances_to_mesh, sample_mesh, score_cloud, views_of
 from arview.geometry import Array, apply, look_at
 from arview.reconstruction.dense import Cad, DenseOptions, read_map, read_ply, reconstruct_dense, write_map, write_ply
 from arview.reconstruction.types import DenseCloud, PosedPhoto, SparseModel
 from arview.rendering.rasterizer import rasterise
+from arview_lab.evaluation.clouds import distances_to_mesh, sample_mesh, score_cloud, views_of
 
 pytestmark = pytest.mark.slow  # depth maps of all views
 

@@ -12,14 +12,7 @@ from arview.camera import Camera
 from arview.geometry import Array, apply
 from arview.reconstruction.covariance import gauge_of
 from arview.reconstruction.features import FeatureOptions
-from arview.reconstruction.groups import (
-    GroupOptions,
-    group_names,
-    groups_warning,
-    linked_groups,
-    relative_px,
-    shared_points,
-)
+from arview.reconstruction.groups import group_names, groups_warning, linked_groups, relative_px, shared_points
 from arview.reconstruction.sparse import SparseOptions, reconstruct_sparse
 from arview.reconstruction.types import Photo, PosedPhoto, SparseModel
 from helpers.photo_scene import CAMERA, bench, photograph, ring, write_photos

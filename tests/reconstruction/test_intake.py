@@ -15,7 +15,7 @@ from arview.camera.read import save_camera
 from arview.core.stage_cache import key_of
 from arview.errors import InputError, MismatchError
 from arview.reconstruction.intake import VideoIntakeOptions, intake_frames, intake_photos, intake_video, read_photo
-from arview.reconstruction.intake.checks import CheckOptions, blur_and_texture, same_views, thumbnail
+from arview.reconstruction.intake.checks import blur_and_texture, same_views, thumbnail
 from arview.reconstruction.intake.lenses import Lens, lenses_of
 from arview.reconstruction.intake.reading import glance
 from arview.reconstruction.intake.video import choose_frames
@@ -361,8 +361,8 @@ def test_duplicates(tmp_path: Path) -> None:
     assert "good_1.jpg" in rejected["again.jpg"]
     assert moved.name in {photo.name for photo in intake.photos}
     thumbs = [thumbnail(gray_of(view(x))) for x in (0, 4, 8, 16)]
-    assert same_views(thumbs, CheckOptions()) == []
-    assert same_views([thumbs[0], thumbnail(gray_of(view(0, 0, 5)))], CheckOptions()) == [(0, 1)]
+    assert same_views(thumbs) == []
+    assert same_views([thumbs[0], thumbnail(gray_of(view(0, 0, 5)))]) == [(0, 1)]
 
 
 def test_too_little_to_work_with(tmp_path: Path) -> None:

@@ -16,14 +16,7 @@ from arview.reconstruction.intake.kept import keeping_photos
 from arview.reconstruction.intake.reading import read_photo
 from arview.reconstruction.matching import Matches, match_descriptors
 from arview.reconstruction.memory import SparseMemory, feature_prints
-from arview.reconstruction.pairs import (
-    KnownPairs,
-    PairOptions,
-    chosen_pairs,
-    doubtful_pairs,
-    read_pairs,
-    write_pairs,
-)
+from arview.reconstruction.pairs import KnownPairs, chosen_pairs, doubtful_pairs, read_pairs, write_pairs
 from arview.reconstruction.types import Photo
 from helpers.photo_scene import CAMERA, ring
 
@@ -54,9 +47,9 @@ def test_rough_poses_choose_the_pairs() -> None:
     poses = ring(COUNT, elevations_deg=(30.0,))
     known = KnownPairs(poses={one.name: pose for one, pose in zip(PHOTOS, poses, strict=True)})
     with ThreadPoolExecutor(2) as pool:
-        by_pose = chosen_pairs(PHOTOS, unlike(), OPTIONS, known, pool)
-        by_look = chosen_pairs(PHOTOS, unlike(), OPTIONS, KnownPairs(), pool)
-        few = chosen_pairs(PHOTOS, unlike(), replace(OPTIONS, hints_from=COUNT + 1), known, pool)
+        by_pose = chosen_pairs(PHOTOS, unlike(), known, pool)
+        by_look = chosen_pairs(PHOTOS, unlike(), KnownPairs(), pool)
+        few = chosen_pairs(PHOTOS, unlike(), known, pool)
     apart = {min(j - i, COUNT - j + i) for i, j in by_pose}
     assert apart == {1, 2} and len(by_pose) == 2 * COUNT  # 26° from photo to photo, less between their axes
     assert few == by_look
@@ -69,11 +62,11 @@ def test_a_photo_with_a_wrong_pose_is_matched_by_its_look() -> None:
     poses = ring(COUNT, elevations_deg=(30.0,))
     known = KnownPairs(poses={one.name: pose for one, pose in zip(PHOTOS, poses, strict=True)})
     with ThreadPoolExecutor(2) as pool:
-        tried = chosen_pairs(PHOTOS, features, OPTIONS, known, pool)
+        tried = chosen_pairs(PHOTOS, features, known, pool)
         assert (2, 9) not in tried
         matched = [pair for pair in tried if not {2, 9} & set(pair)]
-        assert (2, 9) in doubtful_pairs(PHOTOS, features, OPTIONS, known, tried, matched, pool)
-        assert doubtful_pairs(PHOTOS, features, OPTIONS, known, tried, tried, pool) == []
+        assert (2, 9) in doubtful_pairs(PHOTOS, features, known, tried, matched, pool)
+        assert doubtful_pairs(PHOTOS, features, known, tried, tried, pool) == []
 
 
 def test_recorded_pairs_are_matched_and_no_others(tmp_path: Path) -> None:
@@ -81,9 +74,9 @@ def test_recorded_pairs_are_matched_and_no_others(tmp_path: Path) -> None:
     write_pairs(tmp_path / "pairs.json", PHOTOS, pairs)
     known = read_pairs(tmp_path / "pairs.json")
     with ThreadPoolExecutor(2) as pool:
-        assert chosen_pairs(PHOTOS, unlike(), OPTIONS, known, pool) == pairs
-        assert chosen_pairs(PHOTOS[:5], unlike()[:5], OPTIONS, known, pool) == [(2, 3)]
-        assert doubtful_pairs(PHOTOS, unlike(), OPTIONS, known, pairs, [], pool) == []
+        assert chosen_pairs(PHOTOS, unlike(), known, pool) == pairs
+        assert chosen_pairs(PHOTOS[:5], unlike()[:5], known, pool) == [(2, 3)]
+        assert doubtful_pairs(PHOTOS, unlike(), known, pairs, [], pool) == []
     assert known.key() != KnownPairs().key()
 
 

@@ -9,7 +9,7 @@ from arview.cad.model import Model, make_model
 from arview.camera import Camera
 from arview.errors import InputError
 from arview.geometry import look_at
-from arview.reconstruction.seen_surface import SeenOptions, seen_surface
+from arview.reconstruction.seen_surface import seen_surface
 from helpers.cad_files import box
 from helpers.synthetic import component
 

@@ -94,7 +94,7 @@ def _normals_at(pixels: NDArray[np.int64], faces: NDArray[np.int32], seen: Array
 def shaded(
     model: Model, image: NDArray[np.uint8], pose: Array, information: Array = WEAK
 ) -> tuple[Array, Array, float]:
-    crop = crop_for_shading(image, CAMERA, model.diameter_mm, pose, OPTIONS)
+    crop = crop_for_shading(image, CAMERA, model.diameter_mm, pose)
     assert crop is not None
     found, more, explained = refine_by_shading(
         crop, surface_of(model), corners_of(model), model.diameter_mm, pose, information, OPTIONS.gain, OPTIONS.rounds
@@ -188,7 +188,7 @@ def test_there_is_no_crop_outside_the_picture() -> None:
     for way in ((900.0, 0.0, 0.0), (0.0, 0.0, -800.0), (np.nan, 0.0, 0.0)):
         pose = TRUTH.copy()
         pose[:3, 3] += way
-        assert crop_for_shading(image, CAMERA, blob().diameter_mm, pose, OPTIONS) is None
+        assert crop_for_shading(image, CAMERA, blob().diameter_mm, pose) is None
 
 
 def test_a_picture_without_the_part_moves_a_pose_little() -> None:
@@ -201,7 +201,7 @@ def test_a_picture_without_the_part_moves_a_pose_little() -> None:
 def test_a_pose_that_nothing_determines_stays_as_it_is() -> None:
     surface, corners = surface_of(blob()), corners_of(blob())
     flat = np.full((CAMERA.height, CAMERA.width), 90, dtype=np.uint8)
-    crop = crop_for_shading(flat, CAMERA, blob().diameter_mm, TRUTH, OPTIONS)
+    crop = crop_for_shading(flat, CAMERA, blob().diameter_mm, TRUTH)
     assert crop is not None
     pose, information, explained = refine_by_shading(
         crop, surface, corners, blob().diameter_mm, TRUTH, np.zeros((6, 6)), OPTIONS.gain, OPTIONS.rounds

@@ -8,7 +8,6 @@ from arview.camera import Camera
 from arview.errors import InputError
 from arview.geometry import apply, exp_se3, invert, look_at, rotation_angle_rad
 from arview.refinement.gauss_newton import apply_twist, solve_step
-from arview.refinement.modalities.keyframes import TextureOptions
 from arview.refinement.modalities.texture import TextureModality
 from arview.refinement.modalities.texture_matching import add_matches
 from arview.rendering.raycast import RayCaster

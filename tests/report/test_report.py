@@ -34,8 +34,8 @@ from arview.rendering.rasterizer import rasterise
 from arview.report import gather, make_report
 from arview.report import make as make_module
 from arview.report.formatting import finding_text, number, zone_text
-from arview.report.pictures import CropOptions, make_gallery, overview
-from arview.report.scene import SceneOptions, make_scene, scene_json
+from arview.report.pictures import make_gallery, overview
+from arview.report.scene import make_scene, scene_json
 from helpers.inspections import bench_inspection, deviation, inspection
 from helpers.photo_scene import CAMERA, bench, photograph, ring, write_photos
 
@@ -132,7 +132,7 @@ def test_crops_show_the_ghost_at_the_design_place_and_the_arrow_where_it_points(
 ) -> None:
     sparse = in_datum_frame(reconstruction)
     options = CropOptions(width_px=480, height_px=360)
-    gallery = make_gallery(found, model, sparse, options)
+    gallery = make_gallery(found, model, sparse)
     assert not gallery.unread
     assert {name: len(crops) for name, crops in gallery.components.items()} == {
         "block_1": 1, "block_2": 2, "block_3": 2, "block_4": 2, "plate": 2,
@@ -165,7 +165,7 @@ def test_the_ghost_lies_on_the_block_in_the_photo(
     sparse = in_datum_frame(reconstruction)
     plain = replace(found, components=(replace(found.components[0]),), foreign_objects=())
     options = CropOptions(width_px=640, height_px=480, share=0.01, min_px=640)  # the whole photo
-    crop = make_gallery(plain, model, sparse, options).components["block_1"][0]
+    crop = make_gallery(plain, model, sparse).components["block_1"][0]
     photo = next(one for one in sparse.photos if one.name == crop.photo)
     from arview.reconstruction.intake.reading import read_photo
 

@@ -17,8 +17,7 @@ from arview.guideviews import GuideViewOptions, GuideViewSet, make_guide_views
 from arview.pose import TrackingState
 from arview.refinement.evidence import PoseEvidence
 from arview.tracking import Estimate, SessionOptions, TrackingSession
-from arview.tracking.appearance_memory import AppearanceMemory, AppearanceMemoryOptions
-from arview.tracking.search.ncc_search import NccSearchOptions
+from arview.tracking.appearance_memory import AppearanceMemory
 from arview.tracking.search.view_crops import CROP_PX, ViewCropper
 from helpers.synthetic import CAMERA, RANGE, assembly, assembly_views, bracket, error, path, picture, pose_from
 

@@ -17,7 +17,7 @@ from arview.pose import Identity, Pose, TrackingState
 from arview.refinement.evidence import PoseEvidence
 from arview.tracking import Estimate, TrackingSession
 from arview.tracking.guided_init import GuidedPose
-from arview.tracking.identity import IdentityMonitor, IdentityOptions
+from arview.tracking.identity import IdentityMonitor
 from arview.tracking.identity.background_motion import BackgroundMotion, reduced
 from arview.tracking.identity.monitor import ANOTHER_IN_VIEW, CHECKING, MOVED
 from arview.tracking.identity.part_outline import PartOutline, transfer

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from arview.geometry import Array, exp_so3, rigid
-from arview.tracking.identity.options import OwnMotionOptions
 from arview.tracking.identity.own_motion import OwnMotion
 from arview.tracking.identity.part_outline import PartOutline
 from helpers.synthetic import CAMERA, assembly_views, pose_from
@@ -28,7 +27,7 @@ def moved(offset_mm: Array, turn_deg: float = 0.0) -> Array:
 
 def followed(noise_mm: float = 0.4) -> OwnMotion:
     rng = np.random.default_rng(0)
-    motion = OwnMotion(PartOutline(assembly_views(), CAMERA), OwnMotionOptions())
+    motion = OwnMotion(PartOutline(assembly_views(), CAMERA))
     for frame in range(LAST + 1):
         motion.add(frame, moved(frame * STEP + rng.normal(0.0, noise_mm, 3)))
     return motion
@@ -68,7 +67,7 @@ def test_a_frame_in_doubt_before_the_loss_does_not_end_the_motion() -> None:
 
 
 def test_nothing_is_said_without_a_motion() -> None:
-    motion = OwnMotion(PartOutline(assembly_views(), CAMERA), OwnMotionOptions())
+    motion = OwnMotion(PartOutline(assembly_views(), CAMERA))
     assert not motion.leads_to(1, START)
     motion.add(0, START)
     assert not motion.leads_to(1, START)

@@ -81,7 +81,7 @@ def test_a_large_part_is_kept_small_and_in_its_place() -> None:
     pose = rigid(np.eye(3), [30.0, 20.0, 500.0])
     u, v = np.round(camera.project(pose[:3, 3])).astype(int)
     image[v - 40 : v + 41, u - 40 : u + 41] = 220
-    frame = cropped_frame(image, pose, camera, 220.0, FrameSet(camera).options)
+    frame = cropped_frame(image, pose, camera, 220.0)
     assert frame is not None and frame.scale == pytest.approx(400.0 * 500.0 / (220.0 * 1700.0))
     assert frame.gray.size < 520 * 520
     rows, columns = np.nonzero(frame.gray > 130)
@@ -94,7 +94,7 @@ def test_frames_are_kept_when_the_view_is_new() -> None:
     frames = FrameSet(GUESS)
     pose = rigid(np.eye(3), [0.0, 0.0, 600.0])
     gray = np.zeros((200, 200), dtype=np.uint8)
-    first = cropped_frame(np.zeros((480, 640, 3), dtype=np.uint8), pose, GUESS, 200.0, frames.options)
+    first = cropped_frame(np.zeros((480, 640, 3), dtype=np.uint8), pose, GUESS, 200.0)
     assert first is not None and first.gray.shape != gray.shape
     assert frames.is_new(pose, GUESS.fx) and frames.add(first)
     assert not frames.is_new(pose, GUESS.fx)

@@ -119,7 +119,7 @@ def test_another_part_that_is_tracked_is_hidden_from_the_first_round_of_searches
     assert sorted(side for side in found if side is not None) == [0, 1]
     assert len(second.covers) == 1 and second.others == ()
     # A part may stand on another: in the next round nothing is hidden.
-    plan = SearchPlan(others, camera, second.options)
+    plan = SearchPlan(others, camera)
     assert plan.hides_parts(SessionState(frames_without_pose=1))
     assert not plan.hides_parts(SessionState(frames_without_pose=2 * second.options.search_every))
     assert searched_picture(image, (), second.covers, others, camera) is not image

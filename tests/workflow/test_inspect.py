@@ -19,8 +19,8 @@ from arview.cli import ExitCode, main
 from arview.cli.exit_codes import exit_code_of
 from arview.core.stage_cache import Stages, content_key
 from arview.errors import InputError, MissingDependencyError, OutputError
-from arview.history import HistoryStore
 from arview.inspection import Inspection, Verdict, load_inspection
+from arview.quality.history import HistoryStore
 from arview.reconstruction.intake import Intake
 from arview.reconstruction.run import Reconstruction
 from arview.workflow.lock import exclusive_access

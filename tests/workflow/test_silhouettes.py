@@ -16,7 +16,6 @@ from arview.cad.model import Model, make_model
 from arview.cli import main
 from arview.errors import CannotMeasureError, InputError
 from arview.geometry import Array, rigid, rotation_angle_rad
-from arview.measurement.photo.options import EdgeOptions, SweepOptions
 from arview.reconstruction.dense import DenseOptions
 from arview.reconstruction.features import FeatureOptions
 from arview.reconstruction.run import Reconstruction, ReconstructOptions, reconstruct

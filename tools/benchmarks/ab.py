@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import json
 import os
 import re
@@ -51,6 +52,7 @@ EXIT_SLOWER, EXIT_INPUT, EXIT_FAILED = 1, 2, 70
 
 def main() -> int:
     if sys.argv[1:2] == ["--child"]:
+        use_own_evaluation()
         print(json.dumps({"ms": CHILDREN[sys.argv[2]](), "arview": arview_folder()}))
         return 0
     chosen = parser().parse_args()
@@ -123,7 +125,8 @@ def run(measure: str, source: Path) -> float:
     Raises:
         RuntimeError: it failed, or imported another arview.
     """
-    environment = {**os.environ, "PYTHONPATH": str(source)}
+    laboratory = source.parent / "tools" / "lab"
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(source), str(laboratory)])}
     command = [sys.executable, str(Path(__file__).resolve()), "--child", measure]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     if done.returncode:
@@ -163,15 +166,21 @@ def arview_folder() -> str:
     return str(Path(arview.__file__).resolve().parent)
 
 
+def use_own_evaluation() -> None:
+    """Trees from before `tools/lab` have the evaluation in arview itself: take it from there."""
+    if importlib.util.find_spec("arview.evaluation") is not None:
+        sys.modules["arview_lab.evaluation"] = importlib.import_module("arview.evaluation")
+
+
 def track_ms() -> float:
-    from arview.evaluation import evaluate_scene
+    from arview_lab.evaluation import evaluate_scene
 
     spreads = [evaluate_scene(scene, "truth").summary.track_ms for scene in sequences()]
     return geometric_mean([spread.median for spread in spreads if spread is not None])
 
 
 def detect_ms() -> float:
-    from arview.evaluation import scene_guide_views
+    from arview_lab.evaluation import scene_guide_views
 
     detector_class = import_detector()
     medians = []

@@ -16,13 +16,13 @@ import numpy as np
 
 from arview.detection import Detector
 from arview.errors import ArviewError
-from arview.evaluation import Scene, load_scene, scene_guide_views
-from arview.evaluation.protocols import full_sphere_range
-from arview.evaluation.semisynthetic import SHAPES, SequenceOptions, Variant, make_sequence, shape_job
 from arview.geometry import Array
 from arview.guideviews.cache import cached_guide_views
 from arview.pose import Pose
 from arview.tracking import TrackingSession
+from arview_lab.evaluation import Scene, load_scene, scene_guide_views
+from arview_lab.evaluation.protocols import full_sphere_range
+from arview_lab.semisynthetic import SHAPES, SequenceOptions, Variant, make_sequence, shape_job
 from photos import background_photos
 from recordings import ROOT, VIDEOS, scenes, skip, table
 from rows import watched

@@ -20,9 +20,9 @@ import numpy as np
 from arview.cad import default_view_range
 from arview.detection import Detector
 from arview.errors import ArviewError
-from arview.evaluation import Scene, evaluate_scene, scene_guide_views
 from arview.guideviews import GuideViewOptions, load_guide_views, make_guide_views
 from arview.tracking import SessionOptions
+from arview_lab.evaluation import Scene, evaluate_scene, scene_guide_views
 from recordings import SAMPLE, sample_command, scenes, skip, table
 from suites.cloud_cost import cloud_costs
 from suites.lenses import lens_errors

@@ -17,7 +17,10 @@ import numpy as np
 from arview.cad import load_part
 from arview.camera.read import load_camera
 from arview.errors import InputError
-from arview.evaluation import (
+from arview.geometry import Array, apply, exp_so3, rigid
+from arview.pose import Pose, TrackingState
+from arview.tracking import Tracker, TrackingSession
+from arview_lab.evaluation import (
     FrameResult,
     PoseMeter,
     Scene,
@@ -28,10 +31,7 @@ from arview.evaluation import (
     scene_guide_views,
     summarise,
 )
-from arview.evaluation.semisynthetic import BOX_SHAPES, CONDITIONS, CURVED_SHAPES, SHAPES
-from arview.geometry import Array, apply, exp_so3, rigid
-from arview.pose import Pose, TrackingState
-from arview.tracking import Tracker, TrackingSession
+from arview_lab.semisynthetic import BOX_SHAPES, CONDITIONS, CURVED_SHAPES, SHAPES
 from options import positive
 from recordings import (
     PHOTO_SEQUENCES,

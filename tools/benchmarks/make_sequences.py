@@ -12,8 +12,8 @@ from pathlib import Path
 from arview.cad import Part, load_part
 from arview.core.progress import StepProgress
 from arview.errors import ArviewError, InputError
-from arview.evaluation import Scene, find_scenes, load_scene
-from arview.evaluation.semisynthetic import (
+from arview_lab.evaluation import Scene, find_scenes, load_scene
+from arview_lab.semisynthetic import (
     BOX_SHAPES,
     CONDITIONS,
     CURVED_SHAPES,

@@ -7,7 +7,7 @@ import os
 from pathlib import Path
 
 from arview.errors import InputError
-from arview.evaluation.semisynthetic import photos_in
+from arview_lab.semisynthetic import photos_in
 from recordings import DATA, VIDEOS
 
 PHOTOS_PER_RECORDING = 8

@@ -7,8 +7,10 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from arview.evaluation import Scene, load_scene
+if TYPE_CHECKING:
+    from arview_lab.evaluation import Scene
 
 ROOT = Path(__file__).resolve().parents[2]
 SAMPLE = ROOT / "samples" / "bracket_plate"
@@ -61,6 +63,8 @@ def photo_sets(more: Sequence[Path] = ()) -> list[PhotoSet]:
 
 def scenes(names: tuple[str, ...] = VIDEOS) -> dict[str, Scene]:
     """The available sequences by name, by default the videos; missing ones are named on stderr."""
+    from arview_lab.evaluation import load_scene
+
     found = {}
     for name in names:
         folder = DATA / name / "test" / "000001"

@@ -34,7 +34,7 @@ ROOT = Path(__file__).resolve().parents[2]
 SAMPLE = ROOT / "samples" / "bracket_plate"
 sys.path.insert(0, str(ROOT / "tests"))  # the tests' client
 
-from arview.live.security.addresses import LOOPBACK
+from arview.station.live.security.addresses import LOOPBACK
 from arview.video import Image, open_source
 from helpers.live_client import Camera, Http, Phone, paired_cookie
 from helpers.live_jobs import send

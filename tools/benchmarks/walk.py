@@ -25,11 +25,11 @@ from arview.cad import load_part
 from arview.inspection import Inspection, load_inspection
 from arview.reconstruction.intake.reading import photo_paths
 from arview.reconstruction.run import reconstruct
+from arview.station.walk.job import JobFolder, start_worker
+from arview.station.walk.merged import before_after
 from arview.workflow.job import InspectJob
 from arview.workflow.prepare import prepare
 from arview.workflow.run import measured_in_photos
-from arview.workflow.walk.job import JobFolder, start_worker
-from arview.workflow.walk.merged import before_after
 
 
 def main() -> None:

@@ -56,11 +56,14 @@ def command_page() -> Iterator[str]:
 
 
 def commands(command: click.Command, name: str) -> Iterator[tuple[str, click.Command]]:
-    """A command and those below it, with their whole names."""
+    """A command and those below it, with their whole names; those that installed packages add are among them."""
     yield name, command
     if isinstance(command, click.Group):
-        for child in sorted(command.commands):
-            yield from commands(command.commands[child], f"{name} {child}")
+        context = click.Context(command)
+        for child in command.list_commands(context):
+            found = command.get_command(context, child)
+            if found is not None:
+                yield from commands(found, f"{name} {child}")
 
 
 def help_of(command: click.Command, name: str) -> str:

@@ -9,16 +9,16 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.assembly.log_odds import LogOddsOptions, evidence_features
+from arview.assembly.log_odds import evidence_features
 from arview.assembly.observation import ComponentObserver, Known, base_of
 from arview.cad.model import Model, make_model
 from arview.core.atomic import replacing
-from arview.evaluation.protocols import full_sphere_range
-from arview.evaluation.semisynthetic import CAMERA
-from arview.evaluation.semisynthetic.random_solids import random_solid
 from arview.geometry import Array, apply, exp_so3, rigid
 from arview.guideviews import GuideViewOptions, GuideViewSet, make_guide_views
 from arview.rendering.renderers import ZBufferRenderer
+from arview_lab.evaluation.protocols import full_sphere_range
+from arview_lab.semisynthetic import CAMERA
+from arview_lab.semisynthetic.random_solids import random_solid
 from edge_net_examples import cluttered_picture, lone_picture, occluded_picture
 from presence_net_examples import perturbed_pose, slightly_displaced
 from profile_ranker_examples import OCCLUDER, noisy, some_solids
@@ -134,7 +134,7 @@ def _picture_odds(
         np.zeros(count, dtype=bool),
     )
     evidence, _ = observer.measure(image, perturbed_pose(pose, rng), known)
-    features = evidence_features(evidence, LogOddsOptions())
+    features = evidence_features(evidence)
     for c in np.flatnonzero(evidence.support.supported >= 0.0):
         place = ids == c
         if c == base or not place.any():

@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 
 from arview.core.atomic import replacing
 from arview.errors import InputError
-from arview.evaluation.semisynthetic import photos_in
-from arview.evaluation.semisynthetic.backgrounds import read_photo
 from arview.geometry import Array
-from arview.live.stream.frames import to_jpeg
+from arview.station.live.stream.frames import to_jpeg
 from arview.video import Image
+from arview_lab.semisynthetic import photos_in
+from arview_lab.semisynthetic.backgrounds import read_photo
 from seeded_files import missing_files
 
 WIDTH, HEIGHT = 1280, 960

@@ -13,11 +13,11 @@ from scipy.optimize import minimize
 from tqdm import tqdm
 
 from arview.detection import Detector, DetectorOptions
-from arview.detection.confidence import CONFIDENCE, ConfidenceTerms
+from arview.detection.confidence import MIN_OUTLINE, ConfidenceTerms
 from arview.errors import InputError
-from arview.evaluation.protocols import spread_frames
-from arview.evaluation.semisynthetic import frames_without_part
 from arview.geometry import Array
+from arview_lab.evaluation.protocols import spread_frames
+from arview_lab.semisynthetic import frames_without_part
 from photos import all_photos
 from profile_ranker_examples import ALIKE_PIXELS, REFINED_NEAR, is_alike, is_near, pictures_of
 from recordings import scenes
@@ -82,7 +82,7 @@ def fit_confidence(seeds: range, photos: Sequence[Path]) -> None:
         predicted[folds == fold] = terms[folds == fold] @ fitted[:-1] + fitted[-1]
     final = _fitted(terms, is_right, weights)
     print("probability", np.round(final[:-1], 2).tolist(), "bias", round(float(final[-1]), 2))
-    shown = known[:, OUTLINE] >= CONFIDENCE.min_outline
+    shown = known[:, OUTLINE] >= MIN_OUTLINE
     if 0 < is_right[shown].sum() < shown.sum():
         by_outline = _fitted(known[shown] * WITHOUT_VERIFIER, is_right[shown], weights[shown])
         print("by_outline", np.round(by_outline[:-1], 2).tolist(), "bias", round(float(by_outline[-1]), 2))

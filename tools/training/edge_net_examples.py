@@ -15,15 +15,15 @@ from scipy.spatial.transform import Rotation
 from arview.cad.model import Component, Model, make_model
 from arview.core.atomic import replacing
 from arview.errors import InputError
-from arview.evaluation.semisynthetic import CAMERA
-from arview.evaluation.semisynthetic.backgrounds import read_photo, surroundings
-from arview.evaluation.semisynthetic.random_solids import random_solid
-from arview.evaluation.semisynthetic.sequence import FILL_LIGHT, JOIN_BLUR_PX, KEY_LIGHT, paste
-from arview.evaluation.semisynthetic.shading import Light, Reflectance, ShadedModel
-from arview.evaluation.semisynthetic.solids import box
 from arview.geometry import Array, apply, rigid
 from arview.rendering.rasterizer import rasterise
 from arview.video import Image
+from arview_lab.semisynthetic import CAMERA
+from arview_lab.semisynthetic.backgrounds import read_photo, surroundings
+from arview_lab.semisynthetic.random_solids import random_solid
+from arview_lab.semisynthetic.sequence import FILL_LIGHT, JOIN_BLUR_PX, KEY_LIGHT, paste
+from arview_lab.semisynthetic.shading import Light, Reflectance, ShadedModel
+from arview_lab.semisynthetic.solids import box
 from seeded_files import missing_files
 
 SOLIDS_EACH, PICTURES_EACH = 14, 60

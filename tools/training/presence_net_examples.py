@@ -14,13 +14,13 @@ from arview.assembly.presence_net import PartImage, component_crops
 from arview.cad.model import Component, Model, make_model
 from arview.core.atomic import replacing
 from arview.detection.features.edge_net import EdgeNet
-from arview.evaluation.semisynthetic import CAMERA, VARIANTS, SequenceOptions, render_sequence, trajectory
-from arview.evaluation.semisynthetic.backgrounds import read_photo
-from arview.evaluation.semisynthetic.look_alikes import look_alikes
-from arview.evaluation.semisynthetic.random_solids import random_solid
 from arview.geometry import Array, apply, exp_so3, rigid
 from arview.guideviews.surface import reduced_surface, surface_about
 from arview.refinement.projection import intrinsics_of
+from arview_lab.semisynthetic import CAMERA, VARIANTS, SequenceOptions, render_sequence, trajectory
+from arview_lab.semisynthetic.backgrounds import read_photo
+from arview_lab.semisynthetic.look_alikes import look_alikes
+from arview_lab.semisynthetic.random_solids import random_solid
 from edge_net_examples import cluttered_picture, lone_picture, occluded_picture
 from profile_ranker_examples import ANYWHERE, OCCLUDER, noisy, some_solids
 from seeded_files import missing_files

@@ -22,8 +22,10 @@ from arview.detection.scoring.profile_ranker import RADII_PX, describe_poses
 from arview.detection.search.global_search import WIDE, PoseCandidate, SearchBudget
 from arview.detection.search.hypothesis import Hypothesis
 from arview.errors import InputError
-from arview.evaluation.protocols import full_sphere_range
-from arview.evaluation.semisynthetic import (
+from arview.geometry import Array, exp_so3, rigid
+from arview.guideviews.cache import cached_guide_views
+from arview_lab.evaluation.protocols import full_sphere_range
+from arview_lab.semisynthetic import (
     CAMERA,
     VARIANTS,
     SequenceFrame,
@@ -34,11 +36,9 @@ from arview.evaluation.semisynthetic import (
     render_sequence,
     trajectory,
 )
-from arview.evaluation.semisynthetic.ambiguity import changed_share
-from arview.evaluation.semisynthetic.backgrounds import read_photo
-from arview.evaluation.semisynthetic.random_solids import random_solid
-from arview.geometry import Array, exp_so3, rigid
-from arview.guideviews.cache import cached_guide_views
+from arview_lab.semisynthetic.ambiguity import changed_share
+from arview_lab.semisynthetic.backgrounds import read_photo
+from arview_lab.semisynthetic.random_solids import random_solid
 from edge_net_examples import cluttered_picture, coloured, recoloured
 from seeded_files import missing_files
 

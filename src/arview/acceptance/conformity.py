@@ -21,16 +21,17 @@ COVERAGE = 0.9545
 """Coverage of U with k = 2 for normally distributed errors."""
 
 
-@dataclass(frozen=True)
-class ConformityOptions:
-    """Options of the check of the stated uncertainty."""
-
-    max_draws: int = 1000  # simulated tests for the range of the number of errors within U
-    min_draws: int = 200
-    max_values: int = 500_000  # simulated errors in all, which bounds the draws for many lengths
-    interval: float = 0.95  # share of the tests that the range of this number holds
-    quantiles: tuple[float, float] = (0.025, 0.975)  # ends of that range in the simulation
-    wide_ratio: float = 0.5  # ratio of rms error to standard uncertainty below which U is called wide
+MAX_DRAWS = 1000
+"""Simulated tests for the range of the number of errors within U."""
+MIN_DRAWS = 200
+MAX_VALUES = 500_000
+"""Simulated errors in all, which bounds the draws for many lengths."""
+INTERVAL = 0.95
+"""Share of the tests that the range of this number holds."""
+QUANTILES = (0.025, 0.975)
+"""Ends of that range in the simulation."""
+WIDE_RATIO = 0.5
+"""Ratio of rms error to standard uncertainty below which U is called wide."""
 
 
 @dataclass(frozen=True)
@@ -145,7 +146,6 @@ def verify(
     known: Sequence[KnownLength],
     reference: str,
     limit: PermissibleError | None = None,
-    options: ConformityOptions | None = None,
 ) -> Verification:
     """Compare measured with known lengths.
 
@@ -154,12 +154,10 @@ def verify(
         known: known lengths between them; those whose marks were not measured are listed with the reason.
         reference: label of the known lengths.
         limit: maximum permissible error; without it only U is checked.
-        options: see `ConformityOptions`.
 
     Raises:
         InputError: none of the lengths was measured.
     """
-    options = options or ConformityOptions()
     used, left_out = [], {}
     for one in known:
         absent = [name for name in (one.first, one.second) if name not in measured.marks]
@@ -182,18 +180,28 @@ def verify(
     expected, ratio, held = (0, len(used)), None, UncertaintyCheck.NOT_STATED
     if covariance is not None:
         total = covariance + np.diag([(one.uncertainty_mm / K) ** 2 for one in used])
-        expected = _expected(total, is_shared, options)
+        expected = _expected(total, is_shared)
         ratio = float(np.sqrt(np.mean([one.error_mm**2 for one in results] / np.maximum(np.diag(total), 1e-18))))
         held = (
             UncertaintyCheck.NOT_HELD
             if within < expected[0]
             else UncertaintyCheck.WIDE
-            if ratio < options.wide_ratio
+            if ratio < WIDE_RATIO
             else UncertaintyCheck.HELD
         )
     verdict = _verdict([one.verdict for one in results], held, limit is not None)
     return Verification(
-        measured.label, reference, limit, tuple(results), left_out, within, expected, is_shared, ratio, held, verdict
+        measured.label,
+        reference,
+        limit,
+        lengths=tuple(results),
+        left_out=left_out,
+        within=within,
+        expected=expected,
+        is_shared=is_shared,
+        ratio=ratio,
+        u_held=held,
+        verdict=verdict,
     )
 
 
@@ -246,20 +254,20 @@ def _result(
     return LengthResult(known, length, error, None if std_mm is None else K * std_mm, allowed, verdict, within)
 
 
-def _expected(covariance: Any, is_shared: bool, options: ConformityOptions) -> tuple[int, int]:
+def _expected(covariance: Any, is_shared: bool) -> tuple[int, int]:
     """Range that holds 95 % of the numbers of errors within U if U is correct."""
     from scipy.stats import binom
 
     count = len(covariance)
     if not is_shared:
-        low, high = binom.interval(options.interval, count, COVERAGE)
+        low, high = binom.interval(INTERVAL, count, COVERAGE)
         return int(low), int(high)
     values, vectors = np.linalg.eigh(covariance)
-    draws = min(options.max_draws, max(options.min_draws, options.max_values // count))
+    draws = min(MAX_DRAWS, max(MIN_DRAWS, MAX_VALUES // count))
     noise = np.random.default_rng(0).standard_normal((draws, count))
     errors = noise @ (np.sqrt(np.maximum(values, 0.0)) * vectors).T
     counts = np.sum(np.abs(errors) <= K * np.sqrt(np.diag(covariance)), axis=1)
-    low, high = np.quantile(counts, options.quantiles, method="inverted_cdf")
+    low, high = np.quantile(counts, QUANTILES, method="inverted_cdf")
     return int(low), int(high)
 
 

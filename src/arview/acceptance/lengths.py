@@ -199,10 +199,7 @@ def _of_truth(path: Path, text: str, measured: MeasuredMarks) -> list[KnownLengt
         places[name] = apply(_true_move(path, name, truth[name]), measured.nominal[name])
     if len(places) < 2:
         raise InputError(f"{path}: fewer than two of its components were measured in {measured.label}")
-    return [
-        KnownLength(a, b, float(np.linalg.norm(places[b] - places[a])))
-        for a, b in combinations(sorted(places), 2)
-    ]  # fmt: skip
+    return [KnownLength(a, b, float(np.linalg.norm(places[b] - places[a]))) for a, b in combinations(sorted(places), 2)]
 
 
 def _true_move(path: Path, name: str, entry: Any) -> Array:

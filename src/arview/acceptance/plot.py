@@ -29,20 +29,40 @@ def draw(test: Verification, kind: str = "png") -> bytes:
         axes.axhline(0.0, color=MUTED, linewidth=0.8)
         us = [one.uncertainty_mm for one in test.lengths]
         if all(u is not None for u in us):
-            axes.errorbar(known, errors, yerr=np.array(us, dtype=float), fmt="none", ecolor="#d3dae2", elinewidth=1.2,
-                          zorder=1, label="U (k = 2)")  # fmt: skip
+            axes.errorbar(
+                known,
+                errors,
+                yerr=np.array(us, dtype=float),
+                fmt="none",
+                ecolor="#d3dae2",
+                elinewidth=1.2,
+                zorder=1,
+                label="U (k = 2)",
+            )
         if test.limit is not None:
             steps = np.linspace(0.0, 1.04 * known.max(), 200)
             limit = np.array([test.limit.at(length) for length in steps])
             for sign in (1.0, -1.0):
-                axes.plot(steps, sign * limit, color=INK, linewidth=1.1,
-                          label=f"permissible: ± {test.limit}" if sign > 0 else None)  # fmt: skip
+                axes.plot(
+                    steps,
+                    sign * limit,
+                    color=INK,
+                    linewidth=1.1,
+                    label=f"permissible: ± {test.limit}" if sign > 0 else None,
+                )
         for verdict, color in _COLORS.items():
             mine = np.array([one.verdict is verdict for one in test.lengths])
             shown = verdict if test.limit is not None else "error"
             if mine.any():
-                axes.plot(known[mine], errors[mine], "o", color=color if test.limit else _COLORS[Verdict.PASS],
-                          markersize=4.0, zorder=3, label=f"{shown} ({mine.sum()})")  # fmt: skip
+                axes.plot(
+                    known[mine],
+                    errors[mine],
+                    "o",
+                    color=color if test.limit else _COLORS[Verdict.PASS],
+                    markersize=4.0,
+                    zorder=3,
+                    label=f"{shown} ({mine.sum()})",
+                )
         axes.set_xlim(0.0, 1.04 * known.max())
         axes.set_xlabel("known length, mm")
         axes.set_ylabel("measured minus known, mm")

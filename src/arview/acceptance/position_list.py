@@ -13,10 +13,23 @@ from arview.core.tables import Table, read_table
 from arview.errors import InputError
 from arview.geometry import Array
 
-_NAMES = frozenset({
-    "name", "component", "feature", "element", "label", "id", "point", "characteristic", "komponente", "bauteil",
-    "merkmal", "bezeichnung", "punkt",
-})  # fmt: skip
+_NAMES = frozenset(
+    {
+        "name",
+        "component",
+        "feature",
+        "element",
+        "label",
+        "id",
+        "point",
+        "characteristic",
+        "komponente",
+        "bauteil",
+        "merkmal",
+        "bezeichnung",
+        "punkt",
+    }
+)
 _UNITS = ("mm", "millimeter", "millimetre")
 _EXPECTED = "name with x, y, z or dx, dy, dz, and optionally U"
 

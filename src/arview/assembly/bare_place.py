@@ -7,7 +7,6 @@ has other colours, and also interrupts the edges around.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import cv2
@@ -19,40 +18,32 @@ from arview.geometry import Array
 from arview.guideviews.surface import Surface, draw_surface
 from arview.refinement.projection import project
 
-
-@dataclass(frozen=True)
-class BarePlaceOptions:
-    """Where colours and edges are compared, and how much they may differ.
-
-    Attributes:
-        border_px: pixels this near to a drawn edge are not compared, because the pose is not exact.
-        min_pixels: pixels of a place, or of a reference, with fewer of which it says nothing.
-        reach_px: smallest and largest distance from a place at which the same face is its reference.
-        normal_steps: steps per unit in which normals are rounded to group pixels into faces.
-        max_deviations: standard deviations up to which a pixel has the colour of its reference.
-        noise: smallest standard deviation in grey levels.
-        shading: the same as a share of the brightness.
-        max_noise: largest standard deviation; on a base with more texture few pixels match.
-        max_smoother: factor by which the brightness of a place may vary less than that of its reference.
-        min_behind: edge points behind a place with fewer of which nothing is known.
-        around_px: distance from a place up to which edge points are around it.
-        around_points: points around a place that count, the nearest.
-        min_around: with fewer of them nothing is known.
-    """
-
-    border_px: int = 2
-    min_pixels: int = 12
-    reach_px: tuple[float, float] = (10.0, 40.0)
-    normal_steps: float = 4.0
-    max_deviations: float = 3.0
-    noise: float = 3.0
-    shading: float = 0.04
-    max_noise: float = 16.0
-    max_smoother: float = 2.0
-    min_behind: int = 6
-    around_px: float = 60.0
-    around_points: int = 24
-    min_around: int = 8
+BORDER_PX = 2
+"""Pixels this near to a drawn edge are not compared, because the pose is not exact."""
+MIN_PIXELS = 12
+"""Pixels of a place, or of a reference, with fewer of which it says nothing."""
+REACH_PX = (10.0, 40.0)
+"""Smallest and largest distance from a place at which the same face is its reference."""
+NORMAL_STEPS = 4.0
+"""Steps per unit in which normals are rounded to group pixels into faces."""
+MAX_DEVIATIONS = 3.0
+"""Standard deviations up to which a pixel has the colour of its reference."""
+NOISE = 3.0
+"""Smallest standard deviation in grey levels."""
+SHADING = 0.04
+"""The same as a share of the brightness."""
+MAX_NOISE = 16.0
+"""Largest standard deviation; on a base with more texture few pixels match."""
+MAX_SMOOTHER = 2.0
+"""Factor by which the brightness of a place may vary less than that of its reference."""
+MIN_BEHIND = 6
+"""Edge points behind a place with fewer of which nothing is known."""
+AROUND_PX = 60.0
+"""Distance from a place up to which edge points are around it."""
+AROUND_POINTS = 24
+"""Points around a place that count, the nearest."""
+MIN_AROUND = 8
+"""With fewer of them nothing is known."""
 
 
 class BarePlaces(NamedTuple):
@@ -95,13 +86,9 @@ class BarePlaceMeter:
         surface: of the part, about its centre.
         count: of its components.
         diameter_mm: of the part.
-        options: see `BarePlaceOptions`.
     """
 
-    def __init__(
-        self, surface: Surface, count: int, diameter_mm: float, options: BarePlaceOptions | None = None
-    ) -> None:
-        self.options = options or BarePlaceOptions()
+    def __init__(self, surface: Surface, count: int, diameter_mm: float) -> None:
         self._surface, self._count, self._diameter_mm = surface, count, diameter_mm
 
     def measure(
@@ -134,28 +121,27 @@ class BarePlaceMeter:
         shape = image.shape[:2]
         nominal = self._draw(cam_from_body, intrinsics, shape, ~is_absent | is_wanted)
         bare = self._draw(cam_from_body, intrinsics, shape, is_trusted)
-        o = self.options
         smooth = _opponent_colours(cv2.GaussianBlur(image, (3, 3), 0))
         is_sure = (nominal.owners == bare.owners) & (bare.owners >= 0) & (nominal.faces == bare.faces)
-        is_sure &= _is_inner(nominal, o.border_px)
-        is_inner = _is_inner(bare, o.border_px)
+        is_sure &= _is_inner(nominal, BORDER_PX)
+        is_inner = _is_inner(bare, BORDER_PX)
         colours = self._face_colours(smooth, bare.faces, is_sure)
         for c in np.flatnonzero(is_wanted):
             place = nominal.owners == c
             rows, columns = np.flatnonzero(place.any(axis=1)), np.flatnonzero(place.any(axis=0))
             if len(rows) == 0:
                 continue
-            margin = int(o.around_px)
+            margin = int(AROUND_PX)
             low = np.maximum([rows[0] - margin, columns[0] - margin], 0)
             window = np.s_[low[0] : rows[-1] + margin + 1, low[1] : columns[-1] + margin + 1]
             distance = cv2.distanceTransform((~place[window]).astype(np.uint8), cv2.DIST_L2, 3)
             places.around[c] = self._around(distance, edge_points, low[::-1])
             places.behind[c] = self._behind(place, behind)
             inside = cv2.erode(place[window].astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-            inside = inside if np.count_nonzero(inside) >= o.min_pixels else place[window]
+            inside = inside if np.count_nonzero(inside) >= MIN_PIXELS else place[window]
             compared = inside & is_inner[window] & (bare.owners[window] >= 0)
             places.coverage[c] = np.count_nonzero(compared) / max(int(np.count_nonzero(inside)), 1)
-            if np.count_nonzero(compared) >= o.min_pixels:
+            if np.count_nonzero(compared) >= MIN_PIXELS:
                 places.bare[c], places.ring[c] = self._compare(
                     smooth[window], bare.faces[window], compared, is_sure[window], distance, colours
                 )
@@ -176,7 +162,7 @@ class BarePlaceMeter:
         x, y, z = cam_from_body[:3, 3].tolist()
         origin = np.array(project(x, y, z, intrinsics))
         draw_surface(surface, cam_from_body, intrinsics[:2], origin, self._diameter_mm, drawn, face_ids)
-        steps = self.options.normal_steps
+        steps = NORMAL_STEPS
         rounded = np.round(steps * drawn[:3]).astype(np.int64) + 8
         owners = np.where(face_ids >= 0, surface.component[face_ids], -1).astype(np.int16)
         faces = ((owners.astype(np.int64) * 32 + rounded[0]) * 32 + rounded[1]) * 32 + rounded[2]
@@ -192,7 +178,7 @@ class BarePlaceMeter:
         order = np.argsort(numbers, kind="stable")
         values, starts = np.unique(numbers[order], return_index=True)
         groups = np.split(pixels[order], starts[1:])
-        enough = 3 * self.options.min_pixels
+        enough = 3 * MIN_PIXELS
         return {
             int(value): self._colours(group)
             for value, group in zip(values, groups, strict=True)
@@ -200,11 +186,10 @@ class BarePlaceMeter:
         }
 
     def _colours(self, pixels: NDArray[np.float32]) -> _Colours:
-        o = self.options
         pixels = pixels[:: max(1, len(pixels) // 2000)]
         median = np.median(pixels.astype(np.float64), axis=0)
         deviation = 1.4826 * np.median(np.abs(pixels - median), axis=0)
-        return _Colours(median, np.clip(deviation, o.noise + o.shading * abs(float(median[0])), o.max_noise))
+        return _Colours(median, np.clip(deviation, NOISE + SHADING * abs(float(median[0])), MAX_NOISE))
 
     def _compare(
         self,
@@ -222,8 +207,7 @@ class BarePlaceMeter:
                 pixels that surely show their face, distance from the place.
             colours: of each face.
         """
-        o = self.options
-        reach = float(np.clip(0.8 * np.sqrt(np.count_nonzero(compared)), *o.reach_px))
+        reach = float(np.clip(0.8 * np.sqrt(np.count_nonzero(compared)), *REACH_PX))
         beside = is_sure & (distance > 2.0) & (distance < reach)
         bare, ring, ringed, weight = 0.0, 0.0, 0.0, 0.0
         values, counts = np.unique(faces[compared], return_counts=True)
@@ -233,47 +217,45 @@ class BarePlaceMeter:
                 continue
             near = image[beside & (faces == value)]
             used = everywhere
-            if len(near) >= o.min_pixels:
-                ring += count * _share(near, everywhere, o.max_deviations)
+            if len(near) >= MIN_PIXELS:
+                ring += count * _share(near, everywhere, MAX_DEVIATIONS)
                 ringed += count
                 local = self._colours(near)
                 apart = np.abs(local.median - everywhere.median) / everywhere.deviation
-                used = local if apart.max() < o.max_deviations else everywhere
+                used = local if apart.max() < MAX_DEVIATIONS else everywhere
             pixels = image[compared & (faces == value)]
-            bare += count * _share(pixels, used, o.max_deviations) * self._texture_match(pixels, everywhere)
+            bare += count * _share(pixels, used, MAX_DEVIATIONS) * self._texture_match(pixels, everywhere)
             weight += count
-        if weight < max(o.min_pixels, 0.3 * np.count_nonzero(compared)):
+        if weight < max(MIN_PIXELS, 0.3 * np.count_nonzero(compared)):
             return -1.0, -1.0
         return bare / weight, ring / ringed if ringed > 0 else -1.0
 
     def _texture_match(self, pixels: NDArray[np.float32], colours: _Colours) -> float:
         """1 where the brightness of some pixels (N,3) varies like that of their face, less where it is smoother."""
-        o = self.options
         deviation = 1.4826 * float(np.median(np.abs(pixels[:, 0] - np.median(pixels[:, 0])))) + 1.0
         reference = float(colours.deviation[0])
-        if reference < 2.0 * o.noise:
+        if reference < 2.0 * NOISE:
             return 1.0
-        return float(np.clip(o.max_smoother * deviation / reference, 0.0, 1.0))
+        return float(np.clip(MAX_SMOOTHER * deviation / reference, 0.0, 1.0))
 
     def _behind(self, place: NDArray[np.bool_], points: FoundPoints) -> float:
         """Share of edge points inside a place (H,W) that were found; -1 where there are too few."""
         pixels = np.round(points.pixels).astype(np.intp)
         is_inside = place[pixels[:, 1], pixels[:, 0]]
-        if np.count_nonzero(is_inside) < self.options.min_behind:
+        if np.count_nonzero(is_inside) < MIN_BEHIND:
             return -1.0
         return float(np.mean(points.is_found[is_inside]))
 
     def _around(self, distance: NDArray[np.float32], edge_points: FoundPoints, corner: NDArray[np.intp]) -> float:
         """Share of the nearest trusted edge points that were found; -1 where there are too few."""
-        o = self.options
         pixels, is_found = edge_points.pixels, edge_points.is_found
         places = np.round(pixels).astype(np.intp) - corner
         inside = ((places >= 0) & (places < distance.shape[::-1])).all(axis=1)
         away = distance[places[inside, 1], places[inside, 0]]
-        near = away < o.around_px
-        if np.count_nonzero(near) < o.min_around:
+        near = away < AROUND_PX
+        if np.count_nonzero(near) < MIN_AROUND:
             return -1.0
-        nearest = np.argsort(away[near], kind="stable")[: o.around_points]
+        nearest = np.argsort(away[near], kind="stable")[:AROUND_POINTS]
         return float(np.mean(is_found[inside][near][nearest]))
 
 

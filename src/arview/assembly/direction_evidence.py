@@ -6,34 +6,24 @@ averaged, and further pictures add ever less; new directions add in full.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
 from arview.geometry import Array
 
-
-@dataclass(frozen=True)
-class DirectionOptions:
-    """How observations from one direction are combined.
-
-    Attributes:
-        new_direction_deg: directions this far from all others are new.
-        max_directions: directions that are remembered, the latest.
-        repeat_decay: the n-th observation adds this to the power of n - 1 to the weight of their mean.
-        repeat_floor: every observation after the first `repeats_without_floor` adds this as well.
-        repeats_without_floor: see there.
-        clearing_weight: weight of a direction's evidence for a component that is called mismatched. A displaced
-            component looks right from directions along its displacement.
-    """
-
-    new_direction_deg: float = 6.0
-    max_directions: int = 64
-    repeat_decay: float = 0.35
-    repeat_floor: float = 0.03
-    repeats_without_floor: int = 4
-    clearing_weight: float = 0.5
+NEW_DIRECTION_DEG = 6.0
+"""Directions this far from all others are new."""
+MAX_DIRECTIONS = 64
+"""Directions that are remembered, the latest."""
+REPEAT_DECAY = 0.35
+"""The n-th observation adds this to the power of n - 1 to the weight of their mean."""
+REPEAT_FLOOR = 0.03
+"""Every observation after the first `REPEATS_WITHOUT_FLOOR` adds this as well."""
+REPEATS_WITHOUT_FLOOR = 4
+"""See there."""
+CLEARING_WEIGHT = 0.5
+"""Weight of a direction's evidence for a component that is called mismatched. A displaced component looks right from
+directions along its displacement."""
 
 
 class DirectionEvidence:
@@ -42,15 +32,14 @@ class DirectionEvidence:
     Args:
         component_count: C.
         center_in_model: (3,) the part's centre, mm.
-        options: see `DirectionOptions`.
 
     Attributes:
         observations: (C,) how many said anything of each component.
         spreads_deg: (C,) largest angle between the directions of these.
     """
 
-    def __init__(self, component_count: int, center_in_model: Array, options: DirectionOptions) -> None:
-        self._options, self._center_in_model = options, center_in_model
+    def __init__(self, component_count: int, center_in_model: Array) -> None:
+        self._center_in_model = center_in_model
         self._directions = np.zeros((0, 3))
         self._counts, self._sums = np.zeros((0, component_count)), np.zeros((0, component_count))
         self.observations = np.zeros(component_count, dtype=np.int64)
@@ -69,7 +58,7 @@ class DirectionEvidence:
         """
         nearest = self._nearest(cam_from_model)
         if nearest < 0:
-            kept = self._options.max_directions - 1
+            kept = MAX_DIRECTIONS - 1
             none = np.zeros((1, len(log_odds)))
             self._directions = np.concatenate([self._directions[-kept:], self._direction(cam_from_model)[None]])
             self._counts = np.concatenate([self._counts[-kept:], none])
@@ -89,7 +78,7 @@ class DirectionEvidence:
             model_from_model: (4,4) from the turned pose, on the model's side.
             source: (C,) the component of which each has the evidence from now on; -1 for none.
         """
-        found = DirectionEvidence(len(source), self._center_in_model, self._options)
+        found = DirectionEvidence(len(source), self._center_in_model)
         found._directions = self._directions @ model_from_model[:3, :3]
         is_known = source >= 0
         found._counts, found._sums = (np.where(is_known, rows[:, source], 0.0) for rows in (self._counts, self._sums))
@@ -114,10 +103,9 @@ class DirectionEvidence:
 
     def _combined(self, counts: Array, sums: Array, is_mismatched: NDArray[np.bool_]) -> Array:
         """Log odds (C,) of all observations from one direction, by how many they are and their sum."""
-        o = self._options
-        weight = (1.0 - o.repeat_decay**counts) / (1.0 - o.repeat_decay)
-        weight += o.repeat_floor * np.maximum(counts - o.repeats_without_floor, 0.0)
-        weight = weight * np.where((sums < 0.0) & is_mismatched, o.clearing_weight, 1.0)
+        weight = (1.0 - REPEAT_DECAY**counts) / (1.0 - REPEAT_DECAY)
+        weight += REPEAT_FLOOR * np.maximum(counts - REPEATS_WITHOUT_FLOOR, 0.0)
+        weight = weight * np.where((sums < 0.0) & is_mismatched, CLEARING_WEIGHT, 1.0)
         return np.asarray(weight * sums / np.maximum(counts, 1.0))
 
     def _direction(self, cam_from_model: Array) -> Array:
@@ -128,6 +116,6 @@ class DirectionEvidence:
     def _nearest(self, cam_from_model: Array) -> int:
         """Index of the remembered direction nearest to a pose's, or -1 if all are further than a new one's."""
         cosines = self._directions @ self._direction(cam_from_model)
-        if len(cosines) == 0 or cosines.max() < np.cos(np.deg2rad(self._options.new_direction_deg)):
+        if len(cosines) == 0 or cosines.max() < np.cos(np.deg2rad(NEW_DIRECTION_DEG)):
             return -1
         return int(np.argmax(cosines))

@@ -9,7 +9,6 @@ Source: scores of a shifted edge template by Borgefors (PAMI 1988).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -64,35 +63,28 @@ class PointLimits(NamedTuple):
     color_reach_px: float = 3.0
 
 
-@dataclass(frozen=True)
-class EdgeSupportOptions:
-    """Shifts at which a component's edges are tried.
-
-    Attributes:
-        displaced_mm: largest deviation from the nominal placement that is allowed.
-        displaced_share: the same in diameters of the part; the smaller one holds.
-        pose_px: error of the pose, which is added to it.
-        shift_cost: share of points by which the support must grow at the largest allowed shift.
-        searched_mm: largest shift that is tried.
-        searched_share: the same in diameters of the part.
-        searched_px: the same in the picture; the smallest of the three holds.
-        search_gap_px: gap between allowed and larger shifts.
-        min_search_px: range of larger shifts beyond the allowed ones where the bounds above leave less.
-        search_step_px: grid of the larger shifts.
-        points: limits of the measurement at each point.
-    """
-
-    displaced_mm: float = 2.5
-    displaced_share: float = 0.02
-    pose_px: float = 1.0
-    shift_cost: float = 0.2
-    searched_mm: float = 24.0
-    searched_share: float = 0.15
-    searched_px: float = 44.0
-    search_gap_px: float = 2.0
-    min_search_px: float = 6.0
-    search_step_px: int = 3
-    points: PointLimits = field(default_factory=PointLimits)
+DISPLACED_MM = 2.5
+"""Largest deviation from the nominal placement that is allowed."""
+DISPLACED_SHARE = 0.02
+"""The same in diameters of the part; the smaller one holds."""
+POSE_PX = 1.0
+"""Error of the pose, which is added to it."""
+SHIFT_COST = 0.2
+"""Share of points by which the support must grow at the largest allowed shift."""
+SEARCHED_MM = 24.0
+"""Largest shift that is tried."""
+SEARCHED_SHARE = 0.15
+"""The same in diameters of the part."""
+SEARCHED_PX = 44.0
+"""The same in the picture; the smallest of the three holds."""
+SEARCH_GAP_PX = 2.0
+"""Gap between allowed and larger shifts."""
+MIN_SEARCH_PX = 6.0
+"""Range of larger shifts beyond the allowed ones where the bounds above leave less."""
+SEARCH_STEP_PX = 3
+"""Grid of the larger shifts."""
+POINTS: PointLimits = PointLimits()
+"""Limits of the measurement at each point."""
 
 
 class EdgeSupport(NamedTuple):
@@ -163,11 +155,9 @@ class EdgeSupportMeter:
 
     Args:
         diameter_mm: of the part.
-        options: see `EdgeSupportOptions`.
     """
 
-    def __init__(self, diameter_mm: float, options: EdgeSupportOptions | None = None) -> None:
-        self.options = options or EdgeSupportOptions()
+    def __init__(self, diameter_mm: float) -> None:
         self._diameter_mm = diameter_mm
         self._pictures = EdgePictures()
 
@@ -195,9 +185,13 @@ class EdgeSupportMeter:
         projection = Projection(cam_from_body, intrinsics, 0.01 * self._diameter_mm)
         self._measured = picture, projection
         all_points, unshared = measure_edge_support(
-            picture, edges, none if is_absent is None else is_absent, projection, self._shifts(px_per_mm),
-            self.options.points,
-        )  # fmt: skip
+            picture,
+            edges,
+            none if is_absent is None else is_absent,
+            projection,
+            self._shifts(px_per_mm),
+            POINTS,
+        )
         return MeasuredSupport(EdgeSupport(*all_points), EdgeSupport(*unshared))
 
     def found_points(self, edges: VisibleEdges, is_wanted: NDArray[np.bool_]) -> FoundPoints:
@@ -208,7 +202,7 @@ class EdgeSupportMeter:
             is_wanted: (C,) the components.
         """
         points = self._points(edges, is_wanted[edges.component] & edges.is_own)
-        reach = int(np.ceil(self.options.pose_px)) + 1
+        reach = int(np.ceil(POSE_PX)) + 1
         hits = [(self._hits(points, shift), shift) for shift in _disc(0.0, reach, 1)]
         is_found, shift = max(hits, key=lambda one: (np.count_nonzero(one[0]), -int(np.sum(one[1] ** 2))))
         return FoundPoints(points.pixels, is_found, shift)
@@ -224,7 +218,7 @@ class EdgeSupportMeter:
         pixels, normals, depths = project_lines(
             edges.points_in_body, edges.tangents, True, cam_from_body, intrinsics, step_mm
         )
-        margin = int(np.ceil(self.options.pose_px)) + 3
+        margin = int(np.ceil(POSE_PX)) + 3
         size = np.array(picture.strength.shape[::-1])
         kept = is_wanted & (depths > 0) & (pixels > margin).all(axis=1) & (pixels < size - 1 - margin).all(axis=1)
         return _Projected(pixels[kept], normals[kept], depths[kept])
@@ -240,12 +234,12 @@ class EdgeSupportMeter:
 
     def _shifts(self, px_per_mm: float) -> Shifts:
         """Shifts within the allowed deviation, and those beyond it within the searched distance."""
-        o, diameter_mm = self.options, self._diameter_mm
-        allowed = min(o.displaced_mm, o.displaced_share * diameter_mm) * px_per_mm + o.pose_px
-        searched = min(o.searched_mm * px_per_mm, o.searched_share * diameter_mm * px_per_mm, o.searched_px)
+        diameter_mm = self._diameter_mm
+        allowed = min(DISPLACED_MM, DISPLACED_SHARE * diameter_mm) * px_per_mm + POSE_PX
+        searched = min(SEARCHED_MM * px_per_mm, SEARCHED_SHARE * diameter_mm * px_per_mm, SEARCHED_PX)
         near = _disc(0.0, allowed, 1)
-        far = _disc(allowed + o.search_gap_px, max(searched, allowed + o.min_search_px), o.search_step_px)
-        return Shifts(near, o.shift_cost * np.sum(near**2, axis=1) / allowed**2, far)
+        far = _disc(allowed + SEARCH_GAP_PX, max(searched, allowed + MIN_SEARCH_PX), SEARCH_STEP_PX)
+        return Shifts(near, SHIFT_COST * np.sum(near**2, axis=1) / allowed**2, far)
 
 
 def _disc(inner_px: float, outer_px: float, step: int) -> NDArray[np.int64]:
@@ -259,9 +253,16 @@ def _disc(inner_px: float, outer_px: float, step: int) -> NDArray[np.int64]:
 
 @kernel
 def _best_shift(
-    picture: EdgePicture, c: int, places: NDArray[np.int64], along: NDArray[np.int64], count: int,
-    scores: NDArray[np.float64], shifts: NDArray[np.int64], costs: NDArray[np.float64], lowest: int
-) -> float:  # fmt: skip
+    picture: EdgePicture,
+    c: int,
+    places: NDArray[np.int64],
+    along: NDArray[np.int64],
+    count: int,
+    scores: NDArray[np.float64],
+    shifts: NDArray[np.int64],
+    costs: NDArray[np.float64],
+    lowest: int,
+) -> float:
     """Share of ``count`` points on edges at the best shift, by the sum of scores less its cost.
 
     Args:
@@ -291,9 +292,13 @@ def _best_shift(
 
 @kernel
 def _contrast(
-    image: NDArray[np.uint8], edges: VisibleEdges, is_own: NDArray[np.bool_], projected: _Projected, c: int,
-    reach_px: float
-) -> float:  # fmt: skip
+    image: NDArray[np.uint8],
+    edges: VisibleEdges,
+    is_own: NDArray[np.bool_],
+    projected: _Projected,
+    c: int,
+    reach_px: float,
+) -> float:
     """Mean colour change across a component's outline in standard deviations, over runs of points; -1 without runs."""
     pixels, normals, depths = projected.pixels, projected.normals, projected.depths
     sides = edges.sides
@@ -351,9 +356,13 @@ def _unshared_points(edges: VisibleEdges, projected: _Projected, owners: NDArray
 
 @kernel
 def _usable_points(
-    edges: VisibleEdges, is_own: NDArray[np.bool_], projected: _Projected, c: int, shape: tuple[int, int],
-    usable: NDArray[np.int64]
-) -> tuple[int, float]:  # fmt: skip
+    edges: VisibleEdges,
+    is_own: NDArray[np.bool_],
+    projected: _Projected,
+    c: int,
+    shape: tuple[int, int],
+    usable: NDArray[np.int64],
+) -> tuple[int, float]:
     """Own points (N,) of a component inside the picture: sets their indices in ``usable``.
 
     Returns:
@@ -383,7 +392,7 @@ def _usable_points(
 @kernel
 def _place_points(
     projected: _Projected, usable: NDArray[np.int64], places: NDArray[np.int64], along: NDArray[np.int64]
-) -> int:  # fmt: skip
+) -> int:
     """Choose evenly spread points of those usable: sets their pixels and normals, see `_best_shift`.
 
     Returns:
@@ -404,9 +413,13 @@ def _place_points(
 
 @kernel
 def measure_edge_support(
-    picture: EdgePicture, edges: VisibleEdges, is_absent: NDArray[np.bool_], projection: Projection, shifts: Shifts,
-    limits: PointLimits
-) -> MeasuredSupport:  # fmt: skip
+    picture: EdgePicture,
+    edges: VisibleEdges,
+    is_absent: NDArray[np.bool_],
+    projection: Projection,
+    shifts: Shifts,
+    limits: PointLimits,
+) -> MeasuredSupport:
     """`MeasuredSupport` of all components.
 
     Args:
@@ -421,10 +434,14 @@ def measure_edge_support(
     count = edges.starts.shape[0] - 1
     projected = _Projected(
         *project_lines(
-            edges.points_in_body, edges.tangents, True, projection.cam_from_body, projection.intrinsics,
+            edges.points_in_body,
+            edges.tangents,
+            True,
+            projection.cam_from_body,
+            projection.intrinsics,
             projection.step_mm,
         )
-    )  # fmt: skip
+    )
     pixels = projected.pixels
     find_thin_edges(picture, limits.min_slope)
     found = np.full((8, count), -1.0)

@@ -123,9 +123,12 @@ def find_thin_edges(picture: EdgePicture, min_slope: float) -> None:
 
 @kernel
 def mark_owners(
-    pixels: NDArray[np.float64], depths: NDArray[np.float64], component: NDArray[np.int16],
-    is_left_out: NDArray[np.bool_], owners: NDArray[np.int16]
-) -> None:  # fmt: skip
+    pixels: NDArray[np.float64],
+    depths: NDArray[np.float64],
+    component: NDArray[np.int16],
+    is_left_out: NDArray[np.bool_],
+    owners: NDArray[np.int16],
+) -> None:
     """Set ``owners`` (H,W) int16 to the component whose edges pass within two pixels, or `NOBODYS` or `SHARED`.
 
     Edges of components that are left out (C,) are nobody's.
@@ -146,9 +149,16 @@ def mark_owners(
 
 @kernel
 def strength_at(
-    directions: NDArray[np.int8], strength: NDArray[np.uint8], owners: NDArray[np.int16], c: int,
-    places: NDArray[np.int64], normal: NDArray[np.int64], dx: int, dy: int, lowest: int
-) -> Any:  # fmt: skip
+    directions: NDArray[np.int8],
+    strength: NDArray[np.uint8],
+    owners: NDArray[np.int16],
+    c: int,
+    places: NDArray[np.int64],
+    normal: NDArray[np.int64],
+    dx: int,
+    dy: int,
+    lowest: int,
+) -> Any:
     """Strongest edge within 25° of a normal at three places (3,2), shifted; edges of other components do not count.
 
     ``normal`` (2,) is in 127ths. Edges at pixels of nobody count; those at shared ones only if ``lowest`` is

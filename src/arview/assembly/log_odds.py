@@ -10,7 +10,6 @@ to "there".
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cache
 from typing import NamedTuple
 
@@ -22,11 +21,30 @@ from arview.geometry import Array
 from arview.weights import load_weights
 
 FEATURES = (
-    "constant", "supported", "lead", "contrast", "determined", "determined_supported", "determined_lead",
-    "network_against", "network_for", "is_predicted", "bare", "is_bare_known", "bare_unsupported", "ring",
-    "is_ring_known", "around", "is_around_known", "base",
-    "behind", "is_behind_known", "bare_around", "against_around", "against_unsupported",
-)  # fmt: skip
+    "constant",
+    "supported",
+    "lead",
+    "contrast",
+    "determined",
+    "determined_supported",
+    "determined_lead",
+    "network_against",
+    "network_for",
+    "is_predicted",
+    "bare",
+    "is_bare_known",
+    "bare_unsupported",
+    "ring",
+    "is_ring_known",
+    "around",
+    "is_around_known",
+    "base",
+    "behind",
+    "is_behind_known",
+    "bare_around",
+    "against_around",
+    "against_unsupported",
+)
 """Inputs of the model of places, in order; see `evidence_features`."""
 
 
@@ -53,21 +71,14 @@ class PlaceWeights(NamedTuple):
     present: Array
 
 
-@dataclass(frozen=True)
-class LogOddsOptions:
-    """Bounds of the measurements.
-
-    Attributes:
-        half_reliable_points: number of determined points (see `EdgeSupport.determined`) at which edges count half.
-        typical_contrast: contrast that stands for components without an outline of their own.
-        max_contrast: contrast above which it counts no more.
-        max_network: bound on the network's log odds, in both directions.
-    """
-
-    half_reliable_points: float = 15.0
-    typical_contrast: float = 5.0
-    max_contrast: float = 6.0
-    max_network: float = 5.0
+HALF_RELIABLE_POINTS = 15.0
+"""Number of determined points (see `EdgeSupport.determined`) at which edges count half."""
+TYPICAL_CONTRAST = 5.0
+"""Contrast that stands for components without an outline of their own."""
+MAX_CONTRAST = 6.0
+"""Contrast above which it counts no more."""
+MAX_NETWORK = 5.0
+"""Bound on the network's log odds, in both directions."""
 
 
 class Evidence(NamedTuple):
@@ -119,17 +130,17 @@ def place_weights() -> PlaceWeights:
     return PlaceWeights(absent, present)
 
 
-def edge_log_odds(measured: MeasuredSupport, options: LogOddsOptions) -> Array:
+def edge_log_odds(measured: MeasuredSupport) -> Array:
     """Log odds (C,) by edges alone, 0 for components that are not visible."""
     support, unshared = measured
-    by_edges = np.where(support.supported >= 0.0, _edge_log_odds(support, options), 0.0)
-    return _without_neighbours(by_edges, _edge_log_odds(unshared, options), unshared)
+    by_edges = np.where(support.supported >= 0.0, _edge_log_odds(support), 0.0)
+    return _without_neighbours(by_edges, _edge_log_odds(unshared), unshared)
 
 
-def place_log_odds(evidence: Evidence, options: LogOddsOptions) -> Array:
+def place_log_odds(evidence: Evidence) -> Array:
     """Log odds (C,) by all measurements, 0 for components that are not visible."""
-    by_place = np.where(evidence.support.supported >= 0.0, place_odds(evidence, options).log_odds, 0.0)
-    by_unshared = place_odds(evidence._replace(support=evidence.unshared), options).log_odds
+    by_place = np.where(evidence.support.supported >= 0.0, place_odds(evidence).log_odds, 0.0)
+    by_unshared = place_odds(evidence._replace(support=evidence.unshared)).log_odds
     return _without_neighbours(by_place, by_unshared, evidence.unshared)
 
 
@@ -141,43 +152,58 @@ def _without_neighbours(log_odds: Array, by_unshared: Array, unshared: EdgeSuppo
     return np.where(log_odds < 0.0, np.maximum(log_odds, known), log_odds)
 
 
-def _edge_log_odds(support: EdgeSupport, options: LogOddsOptions) -> Array:
+def _edge_log_odds(support: EdgeSupport) -> Array:
     """Log odds (C,) by one support, in proportion to how well the edges determine a component's position."""
     w = edge_weights()
-    contrast = np.where(
-        support.contrast < 0.0, options.typical_contrast, np.minimum(support.contrast, options.max_contrast)
-    )
+    contrast = np.where(support.contrast < 0.0, TYPICAL_CONTRAST, np.minimum(support.contrast, MAX_CONTRAST))
     log_odds = w.constant + w.supported_share * support.supported
     log_odds += w.supported_lead * (support.supported - support.displaced)
     log_odds += w.colour_contrast * contrast
     determined = np.maximum(support.determined, 0.0)
-    return np.asarray(log_odds * determined / (determined + options.half_reliable_points))
+    return np.asarray(log_odds * determined / (determined + HALF_RELIABLE_POINTS))
 
 
-def place_odds(evidence: Evidence, options: LogOddsOptions) -> PlaceOdds:
+def place_odds(evidence: Evidence) -> PlaceOdds:
     """What the picture shows at each place, by all measurements."""
-    features, weights = evidence_features(evidence, options), place_weights()
+    features, weights = evidence_features(evidence), place_weights()
     return PlaceOdds(features @ weights.absent, features @ weights.present)
 
 
-def evidence_features(evidence: Evidence, options: LogOddsOptions) -> Array:
+def evidence_features(evidence: Evidence) -> Array:
     """Inputs (C,F) of the model of places, see `FEATURES`; measurements that are not known are 0."""
-    o, (support, _, network, places, base) = options, evidence
-    contrast = np.where(support.contrast < 0.0, o.typical_contrast, np.minimum(support.contrast, o.max_contrast))
+    (support, _, network, places, base) = evidence
+    contrast = np.where(support.contrast < 0.0, TYPICAL_CONTRAST, np.minimum(support.contrast, MAX_CONTRAST))
     determined = np.maximum(support.determined, 0.0)
-    reliable = determined / (determined + o.half_reliable_points)
+    reliable = determined / (determined + HALF_RELIABLE_POINTS)
     lead = support.supported - support.displaced
     is_predicted = ~np.isnan(network)
-    predicted = np.clip(np.where(is_predicted, network, 0.0), -o.max_network, o.max_network)
+    predicted = np.clip(np.where(is_predicted, network, 0.0), -MAX_NETWORK, MAX_NETWORK)
     is_bare, is_ring, is_around = places.bare >= 0.0, places.ring >= 0.0, places.around >= 0.0
     is_behind, around = places.behind >= 0.0, np.where(is_around, places.around, 0.0)
     bare = np.where(is_bare, places.bare * places.coverage, 0.0)
     columns = [
-        np.ones(len(network)), support.supported, lead, contrast / o.max_contrast, reliable,
-        reliable * support.supported, reliable * lead, np.maximum(predicted, 0.0), np.minimum(predicted, 0.0),
-        is_predicted, bare, np.where(is_bare, places.coverage, 0.0), bare * (1.0 - support.supported),
-        np.where(is_ring, places.ring, 0.0), is_ring, around, is_around,
-        np.full(len(network), base), np.where(is_behind, places.behind, 0.0), is_behind, bare * around,
-        np.maximum(predicted, 0.0) * around, np.maximum(predicted, 0.0) * (1.0 - support.supported),
-    ]  # fmt: skip
+        np.ones(len(network)),
+        support.supported,
+        lead,
+        contrast / MAX_CONTRAST,
+        reliable,
+        reliable * support.supported,
+        reliable * lead,
+        np.maximum(predicted, 0.0),
+        np.minimum(predicted, 0.0),
+        is_predicted,
+        bare,
+        np.where(is_bare, places.coverage, 0.0),
+        bare * (1.0 - support.supported),
+        np.where(is_ring, places.ring, 0.0),
+        is_ring,
+        around,
+        is_around,
+        np.full(len(network), base),
+        np.where(is_behind, places.behind, 0.0),
+        is_behind,
+        bare * around,
+        np.maximum(predicted, 0.0) * around,
+        np.maximum(predicted, 0.0) * (1.0 - support.supported),
+    ]
     return np.stack([np.asarray(column, dtype=np.float64) for column in columns], axis=1)

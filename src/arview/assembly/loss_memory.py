@@ -7,7 +7,7 @@ been found turned, what was known before the loss holds again.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -15,20 +15,12 @@ import numpy as np
 from arview.assembly.monitor_state import MonitorState
 from arview.geometry import Array, rotation_angle_rad
 
-
-@dataclass(frozen=True)
-class LossMemoryOptions:
-    """When a part that is found again lies as it did, and what counts of the evidence before.
-
-    Attributes:
-        carried_share: share of the summed log odds that counts after the part was lost and found again.
-        brief_frames: frames without a pose up to which a part cannot have been turned by a quarter.
-        same_turn_deg: rotation from the last pose up to which the part then lies as it did.
-    """
-
-    carried_share: float = 0.7
-    brief_frames: int = 15
-    same_turn_deg: float = 45.0
+CARRIED_SHARE = 0.7
+"""Share of the summed log odds that counts after the part was lost and found again."""
+BRIEF_FRAMES = 15
+"""Frames without a pose up to which a part cannot have been turned by a quarter."""
+SAME_TURN_DEG = 45.0
+"""Rotation from the last pose up to which the part then lies as it did."""
 
 
 class KnownBefore(NamedTuple):
@@ -54,8 +46,7 @@ class LossMemory:
         aside: the state at the last loss, until it is taken up.
     """
 
-    def __init__(self, options: LossMemoryOptions) -> None:
-        self._options = options
+    def __init__(self) -> None:
         self.aside: MonitorState | None = None
         self._last_pose: Array | None = None
         self._known: KnownBefore | None = None
@@ -69,10 +60,10 @@ class LossMemory:
 
     def is_as_before(self, cam_from_model: Array, frames_lost: int) -> bool:
         """Whether a part found at a pose (4,4) after some frames without one is turned as it was."""
-        o, last = self._options, self._last_pose
-        if last is None or frames_lost > o.brief_frames:
+        last = self._last_pose
+        if last is None or frames_lost > BRIEF_FRAMES:
             return False
-        return float(np.rad2deg(rotation_angle_rad(cam_from_model, last))) < o.same_turn_deg
+        return float(np.rad2deg(rotation_angle_rad(cam_from_model, last))) < SAME_TURN_DEG
 
     def still_known(self, cam_from_model: Array, frames_lost: int) -> tuple[frozenset[int], bool]:
         """What still holds of a part found at a pose (4,4), see `is_as_before`.
@@ -89,4 +80,4 @@ class LossMemory:
         if self._surest is None or turn not in self._surest.ruled_out:
             return None
         known = self._surest.state
-        return replace(known, log_odds=self._options.carried_share * known.log_odds, last_pose=None, frames_since=0)
+        return replace(known, log_odds=CARRIED_SHARE * known.log_odds, last_pose=None, frames_since=0)

@@ -9,18 +9,17 @@ all parts.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.assembly.direction_evidence import DirectionEvidence, DirectionOptions
-from arview.assembly.loss_memory import KnownBefore, LossMemory, LossMemoryOptions
+from arview.assembly.direction_evidence import DirectionEvidence
+from arview.assembly.loss_memory import CARRIED_SHARE, KnownBefore, LossMemory
 from arview.assembly.monitor_state import MonitorState
-from arview.assembly.observation import ComponentObserver, Known, Observation, ObservationOptions, base_of
+from arview.assembly.observation import ComponentObserver, Known, Observation, base_of
 from arview.assembly.present_lines import PresentLines
-from arview.assembly.turned_poses import Turn, TurnedPoseOptions, TurnedPoses
+from arview.assembly.turned_poses import Turn, TurnedPoses
 from arview.cad.model import Model
 from arview.camera import Camera
 from arview.geometry import Array, are_near, rigid
@@ -32,71 +31,56 @@ VISIBILITIES = (Visibility.VISIBLE, Visibility.HIDDEN, Visibility.OUTSIDE)
 """In the order in which arrays number them."""
 
 
-@dataclass(frozen=True)
-class MonitorOptions:
-    """When components are called missing or present, and how often frames are observed.
-
-    Attributes:
-        mismatch_log_odds: a component with more becomes mismatched: it is named, and the pose is no longer sure.
-        missing_log_odds: a mismatched component with more becomes missing, or displaced. Observations from one
-            direction do not reach it soon: a pose that is a little wrong looks the same for a while.
-        cleared_log_odds: a mismatched component with less is cleared; other components with more are uncertain.
-        verified_log_odds: a component with less is verified: the odds that it is not there are below 1 to 50.
-        suspect_log_odds: a component with more probably is not where the CAD has it.
-        open_log_odds: a component with more is open: it is observed sooner, and at alternative placements too.
-        settled_log_odds: a mismatched component with more is no reason to observe sooner.
-        single_log_odds: a component with more in a single picture is a mismatch of that picture.
-        displaced_log_odds: a mismatched component is displaced if its alternative placement has more.
-        same_shift: alternative placements that differ by less than this share of the part's diameter are the same.
-        max_added: cap on the log odds that one observation adds against a component, because one entering the view is
-            at first only partly visible.
-        motion_px: motion from one frame to the next, in pixels of the observed picture, up to which a picture is sharp,
-            and from which on it is so blurred that edges that are not found say nothing.
-        max_log_odds: bound on the summed log odds, in both directions.
-        forgetting: share of the summed log odds that is lost with each observation.
-        first_observations: frames after a lock that are all observed. No component is called mismatched before the
-            last of them, because noise differs between frames.
-        incomplete_quality: poses of lower quality are observed at once while components are suspect.
-        urgent_frames: frames between these observations.
-        suspect_frames: frames between observations while a component is suspect, or while an open one becomes visible.
-        open_frames: frames between observations while a component is open, or visible but not yet verified.
-        rest_frames: frames between observations while all components are as expected. All three are for new
-            directions; from a known direction the next longer interval is used.
-        fresh_observations: observations from a direction before it counts as known while a component is suspect,
-            because the first ones may have been blurred.
-        inside_share: share of the corners of a component's box that must be in the picture.
-        observation: options of a single observation.
-        turned_poses: options of the comparison with poses in which the base looks the same.
-        directions: options of combining observations from one direction.
-        loss_memory: options of what is kept while the part is lost.
-    """
-
-    mismatch_log_odds: float = 2.0
-    missing_log_odds: float = 4.0
-    cleared_log_odds: float = 0.1
-    verified_log_odds: float = -4.0
-    suspect_log_odds: float = 1.0
-    open_log_odds: float = -1.0
-    settled_log_odds: float = 4.5
-    single_log_odds: float = 1.5
-    displaced_log_odds: float = 2.4
-    same_shift: float = 0.05
-    max_added: float = 1.6
-    motion_px: tuple[float, float] = (25.0, 45.0)
-    max_log_odds: float = 6.0
-    forgetting: float = 0.01
-    first_observations: int = 2
-    incomplete_quality: float = 0.85
-    urgent_frames: int = 2
-    suspect_frames: int = 6
-    open_frames: int = 15
-    rest_frames: int = 45
-    fresh_observations: int = 6
-    inside_share: float = 0.5
-    observation: ObservationOptions = field(default_factory=ObservationOptions)
-    turned_poses: TurnedPoseOptions = field(default_factory=TurnedPoseOptions)
-    directions: DirectionOptions = field(default_factory=DirectionOptions)
-    loss_memory: LossMemoryOptions = field(default_factory=LossMemoryOptions)
+MISMATCH_LOG_ODDS = 2.0
+"""A component with more becomes mismatched: it is named, and the pose is no longer sure."""
+MISSING_LOG_ODDS = 4.0
+"""A mismatched component with more becomes missing, or displaced. Observations from one direction do not reach it soon:
+a pose that is a little wrong looks the same for a while."""
+CLEARED_LOG_ODDS = 0.1
+"""A mismatched component with less is cleared; other components with more are uncertain."""
+VERIFIED_LOG_ODDS = -4.0
+"""A component with less is verified: the odds that it is not there are below 1 to 50."""
+SUSPECT_LOG_ODDS = 1.0
+"""A component with more probably is not where the CAD has it."""
+OPEN_LOG_ODDS = -1.0
+"""A component with more is open: it is observed sooner, and at alternative placements too."""
+SETTLED_LOG_ODDS = 4.5
+"""A mismatched component with more is no reason to observe sooner."""
+SINGLE_LOG_ODDS = 1.5
+"""A component with more in a single picture is a mismatch of that picture."""
+DISPLACED_LOG_ODDS = 2.4
+"""A mismatched component is displaced if its alternative placement has more."""
+SAME_SHIFT = 0.05
+"""Alternative placements that differ by less than this share of the part's diameter are the same."""
+MAX_ADDED = 1.6
+"""Cap on the log odds that one observation adds against a component, because one entering the view is at first only
+partly visible."""
+MOTION_PX = (25.0, 45.0)
+"""Motion from one frame to the next, in pixels of the observed picture, up to which a picture is sharp, and from which
+on it is so blurred that edges that are not found say nothing."""
+MAX_LOG_ODDS = 6.0
+"""Bound on the summed log odds, in both directions."""
+FORGETTING = 0.01
+"""Share of the summed log odds that is lost with each observation."""
+FIRST_OBSERVATIONS = 2
+"""Frames after a lock that are all observed. No component is called mismatched before the last of them, because noise
+differs between frames."""
+INCOMPLETE_QUALITY = 0.85
+"""Poses of lower quality are observed at once while components are suspect."""
+URGENT_FRAMES = 2
+"""Frames between these observations."""
+SUSPECT_FRAMES = 6
+"""Frames between observations while a component is suspect, or while an open one becomes visible."""
+OPEN_FRAMES = 15
+"""Frames between observations while a component is open, or visible but not yet verified."""
+REST_FRAMES = 45
+"""Frames between observations while all components are as expected. All three are for new directions; from a known
+direction the next longer interval is used."""
+FRESH_OBSERVATIONS = 6
+"""Observations from a direction before it counts as known while a component is suspect, because the first ones may have
+been blurred."""
+INSIDE_SHARE = 0.5
+"""Share of the corners of a component's box that must be in the picture."""
 
 
 class AssemblyMonitor:
@@ -106,7 +90,6 @@ class AssemblyMonitor:
         views: guide views; their directions and camera are used.
         camera: of the pictures.
         model: of the guide views.
-        options: see `MonitorOptions`.
         like: another monitor of the same part with the same options, whose preparation is shared.
 
     Attributes:
@@ -122,17 +105,15 @@ class AssemblyMonitor:
         views: GuideViewSet,
         camera: Camera,
         model: Model,
-        options: MonitorOptions | None = None,
         like: AssemblyMonitor | None = None,
     ) -> None:
-        self.options = options or MonitorOptions()
         self._views, self._camera, self._model = views, camera, model
         self._lines: PresentLines | None = None
         self._turned: TurnedPoses = TurnedPoses(
-            model.components, base_of(model), self.options.turned_poses, None if like is None else like._turned
+            model.components, base_of(model), None if like is None else like._turned
         )
         self._has_components = len(model.components) > 1
-        self._observer = ComponentObserver(views, camera, model, self.options.observation)
+        self._observer = ComponentObserver(views, camera, model)
         self._is_base = np.arange(len(model.components)) == self._observer.base
         boxes = np.array([one.bounds_in_model for one in model.components])
         # (8 C,3) corners of the boxes of the components, and (8,3) of the part's.
@@ -194,7 +175,7 @@ class AssemblyMonitor:
         if known is not None:
             self._state, self._is_resumed = known, True
         elif before.observations:
-            self._state = before.turned(turn, self.options.loss_memory.carried_share)
+            self._state = before.turned(turn, CARRIED_SHARE)
 
     def other_poses(self, cam_from_model: Array) -> tuple[Array, ...]:
         """Poses (4,4) in which the base looks the same, and of which nothing has yet shown that they are wrong."""
@@ -216,12 +197,12 @@ class AssemblyMonitor:
             cam_from_model: (4,4) where it was found; None: it is not known how it lies.
             frames_lost: frames without a pose.
         """
-        o, before, now = self.options, self._memory.aside, self._state
+        before, now = self._memory.aside, self._state
         self._memory.aside = None
         if before is None or before is now:
             return
-        share = o.loss_memory.carried_share
-        self._state = before.followed_by(now, share, o.max_log_odds, o.cleared_log_odds)
+        share = CARRIED_SHARE
+        self._state = before.followed_by(now, share, MAX_LOG_ODDS, CLEARED_LOG_ODDS)
         self._is_resumed = True
         if cam_from_model is not None:
             excluded, was_placed = self._memory.still_known(cam_from_model, frames_lost)
@@ -230,7 +211,7 @@ class AssemblyMonitor:
 
     def forget(self) -> None:
         """Forget all observations, those set aside too."""
-        self._memory = LossMemory(self.options.loss_memory)
+        self._memory = LossMemory()
         self.reset()
 
     def reset(self) -> None:
@@ -241,7 +222,7 @@ class AssemblyMonitor:
         self._said: tuple[tuple[int, bool, bool, bytes], Mapping[str, ComponentPresence]] | None = None
         self._state = MonitorState(
             log_odds=np.zeros(count),
-            directions=DirectionEvidence(count, self._views.center_in_model, self.options.directions),
+            directions=DirectionEvidence(count, self._views.center_in_model),
             is_mismatched=np.zeros(count, dtype=bool),
             is_missing=np.zeros(count, dtype=bool),
             is_verified=np.zeros(count, dtype=bool),
@@ -262,14 +243,14 @@ class AssemblyMonitor:
             quality: of the pose; if it is low, perhaps further components are absent.
             is_supported: the pose is sure.
         """
-        o, state = self.options, self._state
+        state = self._state
         state.frames_since += 1
         before, state.last_pose = state.last_pose, cam_from_model
         # From a new direction the lines of absent components that were not seen before are missed.
-        is_urgent = quality < o.incomplete_quality and bool(self._is_suspect().any())
+        is_urgent = quality < INCOMPLETE_QUALITY and bool(self._is_suspect().any())
         if not self._has_components or not (is_supported or is_urgent):
             return
-        if not self._is_due(cam_from_model) and not (is_urgent and state.frames_since >= o.urgent_frames):
+        if not self._is_due(cam_from_model) and not (is_urgent and state.frames_since >= URGENT_FRAMES):
             return
         known = Known(state.is_verified, state.is_mismatched, self._searched())
         observation = self.observe(image, cam_from_model, known)
@@ -277,21 +258,21 @@ class AssemblyMonitor:
         state.frames_since = 0
         state.has_suspects = bool((observation.is_suspect & ~self._is_settled()).any())
         state.was_visible, state.was_occluded = observation.is_visible, observation.is_occluded
-        slow, fast = o.motion_px
+        slow, fast = MOTION_PX
         sharp = float(np.clip((fast - self._observer.motion_px(before, cam_from_model)) / (fast - slow), 0.0, 1.0))
-        capped = np.minimum(observation.log_odds, o.max_added)
+        capped = np.minimum(observation.log_odds, MAX_ADDED)
         capped = np.where(capped > 0.0, sharp * capped, capped)
         added = state.directions.add(cam_from_model, capped, state.is_mismatched)
-        state.log_odds = np.clip((1.0 - o.forgetting) * state.log_odds + added, -o.max_log_odds, o.max_log_odds)
+        state.log_odds = np.clip((1.0 - FORGETTING) * state.log_odds + added, -MAX_LOG_ODDS, MAX_LOG_ODDS)
         self._add_alternatives(observation)
-        verified_below = np.where(state.is_verified, o.cleared_log_odds, o.verified_log_odds)
+        verified_below = np.where(state.is_verified, CLEARED_LOG_ODDS, VERIFIED_LOG_ODDS)
         state.is_verified = state.log_odds < verified_below
-        if state.observations >= o.first_observations:
-            mismatched_above = np.where(state.is_mismatched, o.cleared_log_odds, o.mismatch_log_odds)
+        if state.observations >= FIRST_OBSERVATIONS:
+            mismatched_above = np.where(state.is_mismatched, CLEARED_LOG_ODDS, MISMATCH_LOG_ODDS)
             state.is_mismatched = state.log_odds > mismatched_above
         if self._is_suspect().any() and is_supported:
             self._turned.compare(cam_from_model, lambda pose: self._observer.pose_evidence(image, pose))
-        state.is_missing = state.is_mismatched & (state.is_missing | (state.log_odds > o.missing_log_odds))
+        state.is_missing = state.is_mismatched & (state.is_missing | (state.log_odds > MISSING_LOG_ODDS))
 
     def present_lines(self, part: PartView, cam_from_model: Array, base_part: PartView | None = None) -> PartView:
         """The guide views of the part without the lines of components that probably are not where the CAD has them.
@@ -360,7 +341,7 @@ class AssemblyMonitor:
         """Mismatches by one picture alone; the state of the monitor is neither used nor changed."""
         if not self._has_components:
             return ()
-        return self._messages(self.observe(image, cam_from_model).log_odds > self.options.single_log_odds)
+        return self._messages(self.observe(image, cam_from_model).log_odds > SINGLE_LOG_ODDS)
 
     def _presence_now(self, visibilities: NDArray[np.int8], is_ambiguous: bool) -> dict[str, ComponentPresence]:
         """Presence of each component by its name, for visibilities (C,) as indices of `VISIBILITIES`."""
@@ -380,8 +361,8 @@ class AssemblyMonitor:
 
     def _presences(self, is_ambiguous: bool) -> tuple[list[Presence], NDArray[np.bool_]]:
         """Presence of each component, and (C,) those of which it depends on which of several poses is right."""
-        o, state = self.options, self._state
-        is_displaced = state.is_missing & (state.alternative > o.displaced_log_odds)
+        state = self._state
+        is_displaced = state.is_missing & (state.alternative > DISPLACED_LOG_ODDS)
         is_uncertain = self._is_uncertain() | state.is_mismatched
         found = np.select(
             [is_displaced, state.is_missing, state.is_verified, is_uncertain],
@@ -390,7 +371,7 @@ class AssemblyMonitor:
         )
         is_open = np.full(len(found), is_ambiguous)
         # One that stays verified although the evidence for it has become weak does not vouch for another.
-        firm = np.where(state.is_verified & (state.log_odds >= o.verified_log_odds), Presence.UNVERIFIED, found)
+        firm = np.where(state.is_verified & (state.log_odds >= VERIFIED_LOG_ODDS), Presence.UNVERIFIED, found)
         for turn in self._turned.open_turns(state.is_verified):
             # In the turned pose each component is what was found at the place of its counterpart.
             turned = np.where(turn.counterparts >= 0, firm[turn.counterparts], Presence.UNVERIFIED)
@@ -409,7 +390,7 @@ class AssemblyMonitor:
         # Mostly the whole part is inside the picture.
         if not self._is_inside(self._part_corners, cam_from_model).all():
             is_inside = self._is_inside(self._corners, cam_from_model).reshape(8, -1)
-            found[is_inside.mean(axis=0) < self.options.inside_share] = VISIBILITIES.index(Visibility.OUTSIDE)
+            found[is_inside.mean(axis=0) < INSIDE_SHARE] = VISIBILITIES.index(Visibility.OUTSIDE)
         return found
 
     def _is_inside(self, corners: Array, cam_from_model: Array) -> NDArray[np.bool_]:
@@ -424,28 +405,28 @@ class AssemblyMonitor:
     def _is_uncertain(self) -> NDArray[np.bool_]:
         """(C,) components against which there is some evidence, but not enough."""
         state = self._state
-        return np.asarray((state.log_odds > self.options.cleared_log_odds) & ~state.is_mismatched)
+        return np.asarray((state.log_odds > CLEARED_LOG_ODDS) & ~state.is_mismatched)
 
     def _is_suspect(self) -> NDArray[np.bool_]:
         """(C,) components that probably are not where the CAD has them."""
-        return self._state.is_mismatched | (self._state.log_odds > self.options.suspect_log_odds)
+        return self._state.is_mismatched | (self._state.log_odds > SUSPECT_LOG_ODDS)
 
     def _is_settled(self) -> NDArray[np.bool_]:
         """(C,) mismatched components of which no more evidence is needed soon."""
-        return self._state.is_mismatched & (self._state.log_odds > self.options.settled_log_odds)
+        return self._state.is_mismatched & (self._state.log_odds > SETTLED_LOG_ODDS)
 
     def _add_alternatives(self, observation: Observation) -> None:
         """Add the evidence of one observation for alternative placements, as long as these are the same."""
-        o, state = self.options, self._state
+        state = self._state
         is_searched = np.isfinite(observation.alternative)
         apart = np.linalg.norm(observation.shifts - state.shifts, axis=1)
-        is_same = apart < o.same_shift * self._views.diameter_mm
-        seen = np.where(is_searched, np.clip(observation.alternative, -o.max_added, o.max_added), 0.0)
-        before = np.where(is_same | ~is_searched, state.alternative, np.maximum(state.alternative - o.max_added, 0.0))
+        is_same = apart < SAME_SHIFT * self._views.diameter_mm
+        seen = np.where(is_searched, np.clip(observation.alternative, -MAX_ADDED, MAX_ADDED), 0.0)
+        before = np.where(is_same | ~is_searched, state.alternative, np.maximum(state.alternative - MAX_ADDED, 0.0))
         is_better = is_searched & (is_same | (seen > before))
         state.shifts = np.where(is_better[:, None], observation.shifts, state.shifts)
         total = np.where(is_same | ~is_searched, before + seen, np.maximum(before, seen))
-        state.alternative = np.clip(total, 0.0, o.max_log_odds)
+        state.alternative = np.clip(total, 0.0, MAX_LOG_ODDS)
 
     def _searched(self) -> NDArray[np.bool_]:
         """(C,) components to search for elsewhere: at first all that are open, then one after another.
@@ -453,8 +434,8 @@ class AssemblyMonitor:
         After a loss it is one after another from the start, because more was known before.
         """
         state = self._state
-        is_open = state.log_odds > self.options.open_log_odds
-        is_new = state.observations < self.options.first_observations and self._memory.aside is None
+        is_open = state.log_odds > OPEN_LOG_ODDS
+        is_new = state.observations < FIRST_OBSERVATIONS and self._memory.aside is None
         if is_new or not is_open.any():
             return is_open
         open_indices = np.flatnonzero(is_open)
@@ -462,21 +443,21 @@ class AssemblyMonitor:
 
     def _is_due(self, cam_from_model: Array) -> bool:
         """Whether a frame may add evidence: the sooner, the more components are open."""
-        o, state = self.options, self._state
-        if state.observations < o.first_observations:
+        state = self._state
+        if state.observations < FIRST_OBSERVATIONS:
             return True
-        if state.frames_since < o.suspect_frames:
+        if state.frames_since < SUSPECT_FRAMES:
             return False
         highest = float(np.where(self._is_settled(), 0.0, state.log_odds).max())
-        waits = (o.suspect_frames, o.open_frames, o.rest_frames, o.rest_frames)
-        is_open = highest > o.open_log_odds or bool(np.any(state.was_visible & ~state.is_verified & ~state.is_missing))
-        step = 0 if state.has_suspects or highest > o.cleared_log_odds else 1 if is_open else 2
+        waits = (SUSPECT_FRAMES, OPEN_FRAMES, REST_FRAMES, REST_FRAMES)
+        is_open = highest > OPEN_LOG_ODDS or bool(np.any(state.was_visible & ~state.is_verified & ~state.is_missing))
+        step = 0 if state.has_suspects or highest > CLEARED_LOG_ODDS else 1 if is_open else 2
         if step == 1 and self._shows_new(cam_from_model):
             step = 0
         if state.frames_since < waits[step]:
             return False
         is_fresh = state.directions.is_new(cam_from_model) or (
-            step == 0 and state.directions.observations_from(cam_from_model) < o.fresh_observations
+            step == 0 and state.directions.observations_from(cam_from_model) < FRESH_OBSERVATIONS
         )
         return is_fresh or state.frames_since >= waits[step + 1]
 
@@ -484,7 +465,7 @@ class AssemblyMonitor:
         """Whether this direction shows an open component that the last observation could not show."""
         state = self._state
         is_visible = self._observer.visible_from(cam_from_model, self._state.is_mismatched)
-        return bool(np.any((state.log_odds > self.options.open_log_odds) & ~state.was_visible & is_visible))
+        return bool(np.any((state.log_odds > OPEN_LOG_ODDS) & ~state.was_visible & is_visible))
 
     def _names(self, is_meant: NDArray[np.bool_]) -> tuple[str, ...]:
         return tuple(self._views.component_names[index] for index in np.flatnonzero(is_meant))

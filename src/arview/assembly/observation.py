@@ -6,21 +6,20 @@ confirm, and those that are not verified are also searched for at alternative pl
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.assembly.bare_place import BarePlaceMeter, BarePlaceOptions
-from arview.assembly.edge_support import EdgeSupportMeter, EdgeSupportOptions
-from arview.assembly.log_odds import Evidence, LogOddsOptions, edge_log_odds, place_log_odds, place_odds
-from arview.assembly.placement_search import Alternatives, PlacementSearch, PlacementSearchOptions
-from arview.assembly.placements import PlacementOptions, alternative_placements
+from arview.assembly.bare_place import BarePlaceMeter
+from arview.assembly.edge_support import POINTS, EdgeSupportMeter
+from arview.assembly.log_odds import Evidence, edge_log_odds, place_log_odds, place_odds
+from arview.assembly.placement_search import Alternatives, PlacementSearch
+from arview.assembly.placements import alternative_placements
 from arview.assembly.presence_net import PartImage, PresenceNet, component_crops
 from arview.assembly.turned_poses import TurnEvidence
-from arview.assembly.visible_edges import VisibleEdgeCache, VisibleEdgeOptions, VisibleEdges
+from arview.assembly.visible_edges import VisibleEdgeCache, VisibleEdges
 from arview.cad.model import Model, make_model
 from arview.camera import Camera
 from arview.detection.features.edge_net import EdgeNet
@@ -29,45 +28,30 @@ from arview.guideviews import GuideViewSet
 from arview.guideviews.surface import Surface
 from arview.refinement.projection import intrinsics_of
 
-
-@dataclass(frozen=True)
-class ObservationOptions:
-    """How one picture is turned into log odds.
-
-    Attributes:
-        max_part_px: larger pictures of the part are shrunk to about this size.
-        margin_px: border around the part that is cut out with it, after shrinking.
-        confirmed_log_odds: components with less by their edges are confirmed, and the network does not predict for
-            them, because it is less certain on real pictures.
-        nominal_edges: weight of edge evidence for the nominal placement in the log odds of an alternative one, which
-            otherwise depend on the network alone.
-        trusted_log_odds: components with less by their edges are taken to be there, like those seen in earlier
-            pictures: they are what is seen behind absent ones.
-        suspect_log_odds: components with more are suspects.
-        pose_found: share of the edge points of the base, and of others that are there, up to which the pose counts as
-            wrong, and from which on it counts as right.
-        occluded_probability: components with more are hidden by something before them.
-        max_seen: bound on the log odds for a component in the comparison of poses.
-        max_log_odds: bound on the log odds of one observation, in both directions.
-        visible_edges, edge_support, bare_place, log_odds, placements, placement_search: options of these steps.
-    """
-
-    max_part_px: float = 400.0
-    margin_px: float = 44.0
-    confirmed_log_odds: float = -2.0
-    nominal_edges: float = 0.8
-    trusted_log_odds: float = -2.0
-    suspect_log_odds: float = 1.0
-    pose_found: tuple[float, float] = (0.4, 0.55)
-    occluded_probability: float = 0.5
-    max_seen: float = 3.0
-    max_log_odds: float = 4.0
-    visible_edges: VisibleEdgeOptions = field(default_factory=VisibleEdgeOptions)
-    edge_support: EdgeSupportOptions = field(default_factory=EdgeSupportOptions)
-    bare_place: BarePlaceOptions = field(default_factory=BarePlaceOptions)
-    log_odds: LogOddsOptions = field(default_factory=LogOddsOptions)
-    placements: PlacementOptions = field(default_factory=PlacementOptions)
-    placement_search: PlacementSearchOptions = field(default_factory=PlacementSearchOptions)
+MAX_PART_PX = 400.0
+"""Larger pictures of the part are shrunk to about this size."""
+MARGIN_PX = 44.0
+"""Border around the part that is cut out with it, after shrinking."""
+CONFIRMED_LOG_ODDS = -2.0
+"""Components with less by their edges are confirmed, and the network does not predict for them, because it is less
+certain on real pictures."""
+NOMINAL_EDGES = 0.8
+"""Weight of edge evidence for the nominal placement in the log odds of an alternative one, which otherwise depend on
+the network alone."""
+TRUSTED_LOG_ODDS = -2.0
+"""Components with less by their edges are taken to be there, like those seen in earlier pictures: they are what is seen
+behind absent ones."""
+SUSPECT_LOG_ODDS = 1.0
+"""Components with more are suspects."""
+POSE_FOUND = (0.4, 0.55)
+"""Share of the edge points of the base, and of others that are there, up to which the pose counts as wrong, and from
+which on it counts as right."""
+OCCLUDED_PROBABILITY = 0.5
+"""Components with more are hidden by something before them."""
+MAX_SEEN = 3.0
+"""Bound on the log odds for a component in the comparison of poses."""
+MAX_LOG_ODDS = 4.0
+"""Bound on the log odds of one observation, in both directions."""
 
 
 class Known(NamedTuple):
@@ -127,28 +111,21 @@ class ComponentObserver:
         views: guide views; their directions and camera are used.
         camera: of the pictures.
         model: of the guide views.
-        options: see `ObservationOptions`.
     """
 
-    def __init__(
-        self, views: GuideViewSet, camera: Camera, model: Model, options: ObservationOptions | None = None
-    ) -> None:
-        self._options = options or ObservationOptions()
-        o = self._options
+    def __init__(self, views: GuideViewSet, camera: Camera, model: Model) -> None:
         self._camera, self._surface, self._diameter_mm = camera, views.surface, views.diameter_mm
         self._model_from_body = rigid(np.eye(3), views.center_in_model)
-        self._visible_edges = VisibleEdgeCache(views, model, o.visible_edges)
-        self._meter = EdgeSupportMeter(views.diameter_mm, o.edge_support)
+        self._visible_edges = VisibleEdgeCache(views, model)
+        self._meter = EdgeSupportMeter(views.diameter_mm)
         self._shown: tuple[VisibleEdges, NDArray[np.bool_]] | None = None
         self._count, self.base = len(views.component_names), base_of(model)
         base = model.components[self.base]
-        self._base_edges = VisibleEdgeCache(views, make_model(base.name, (base,)), o.visible_edges)
-        self._places = BarePlaceMeter(views.surface, self._count, views.diameter_mm, o.bare_place)
+        self._base_edges = VisibleEdgeCache(views, make_model(base.name, (base,)))
+        self._places = BarePlaceMeter(views.surface, self._count, views.diameter_mm)
         self._edge_net, self._presence_net = EdgeNet(), PresenceNet()
-        placements = alternative_placements(model, o.placements)
-        self._search = PlacementSearch(
-            placements, views.surface, views.diameter_mm, self._presence_net, o.placement_search
-        )
+        placements = alternative_placements(model)
+        self._search = PlacementSearch(placements, views.surface, views.diameter_mm, self._presence_net)
         low, high = model.bounds_in_model
         self._corners_in_model = np.array([[(low, high)[i >> k & 1][k] for k in range(3)] for i in range(8)])
 
@@ -160,12 +137,11 @@ class ComponentObserver:
             cam_from_model: (4,4) mm, exact to a pixel or two.
             known: what earlier pictures have shown; None: nothing, and all components are searched for.
         """
-        o = self._options
         known = known or nothing_known(self._count)
         evidence, picture = self.measure(image, cam_from_model, known)
         is_visible = evidence.support.supported >= 0.0
-        odds = place_odds(evidence, o.log_odds)
-        by_place = place_log_odds(evidence, o.log_odds)
+        odds = place_odds(evidence)
+        by_place = place_log_odds(evidence)
         occluded = np.where(is_visible, odds.occluded, 0.0)
         # The base carries the pose: where it is not seen, nothing is known.
         by_place[self.base] = min(by_place[self.base], 0.0)
@@ -173,18 +149,18 @@ class ComponentObserver:
         if picture is not None and known.is_searched.any():
             nominal = np.where(evidence.network > 0.0, (1.0 - occluded) * evidence.network, evidence.network)
             found = self._search.search(picture, nominal, known.is_searched)
-        alternative = found.log_odds + o.nominal_edges * np.minimum(by_place, 0.0)
+        alternative = found.log_odds + NOMINAL_EDGES * np.minimum(by_place, 0.0)
         alternative = np.where(alternative > 0.0, (1.0 - occluded) * alternative, alternative)
         log_odds = np.maximum(by_place, alternative)
         # A wrong pose leaves the base's edges unsupported, too: nothing then counts against a component.
-        low, high = o.pose_found
+        low, high = POSE_FOUND
         is_right = float(np.clip((evidence.base - low) / (high - low), 0.0, 1.0))
-        log_odds = np.clip(np.where(log_odds > 0.0, is_right * log_odds, log_odds), -o.max_log_odds, o.max_log_odds)
+        log_odds = np.clip(np.where(log_odds > 0.0, is_right * log_odds, log_odds), -MAX_LOG_ODDS, MAX_LOG_ODDS)
         return Observation(
             log_odds=log_odds,
-            is_suspect=log_odds > o.suspect_log_odds,
+            is_suspect=log_odds > SUSPECT_LOG_ODDS,
             is_visible=is_visible,
-            is_occluded=is_visible & (occluded > o.occluded_probability),
+            is_occluded=is_visible & (occluded > OCCLUDED_PROBABILITY),
             alternative=alternative,
             shifts=found.shifts,
         )
@@ -193,23 +169,28 @@ class ComponentObserver:
         self, image: NDArray[np.uint8], cam_from_model: Array, known: Known
     ) -> tuple[Evidence, PartImage | None]:
         """All measurements but the search for alternative placements, and the picture around the part for that."""
-        o = self._options
         crop = self._part_crop(image, cam_from_model)
         edges = self._visible_edges.nearest(cam_from_model, known.is_absent)
         measured = self._meter.measure(
             crop.image, edges, crop.cam_from_body, crop.intrinsics, crop.px_per_mm, known.is_absent
         )
         is_visible = measured.support.supported >= 0.0
-        by_edges = edge_log_odds(measured, o.log_odds)
-        is_doubtful = is_visible & (by_edges > o.confirmed_log_odds)
-        is_trusted = known.is_present | (by_edges < o.trusted_log_odds)
+        by_edges = edge_log_odds(measured)
+        is_doubtful = is_visible & (by_edges > CONFIRMED_LOG_ODDS)
+        is_trusted = known.is_present | (by_edges < TRUSTED_LOG_ODDS)
         is_trusted[self.base] = True
         points = self._meter.found_points(edges, is_trusted)
         is_doubtful[self.base] = False
         places = self._places.measure(
-            crop.image, crop.cam_from_body, crop.intrinsics, is_doubtful, is_trusted, known.is_absent, points,
+            crop.image,
+            crop.cam_from_body,
+            crop.intrinsics,
+            is_doubtful,
+            is_trusted,
+            known.is_absent,
+            points,
             self._meter.found_behind(self._base_edges.nearest(cam_from_model), points.shift),
-        )  # fmt: skip
+        )
         network, picture = np.full(self._count, np.nan), None
         if (is_doubtful | known.is_searched).any():
             picture = PartImage(crop.image, self._edge_net.predict(crop.image), crop.intrinsics, crop.cam_from_body)
@@ -219,14 +200,13 @@ class ComponentObserver:
 
     def pose_evidence(self, image: NDArray[np.uint8], cam_from_model: Array) -> TurnEvidence:
         """How much of the base, and of components at their nominal placements, a picture shows at a pose."""
-        o = self._options
         crop = self._part_crop(image, cam_from_model)
         edges = self._visible_edges.nearest(cam_from_model)
         measured = self._meter.measure(crop.image, edges, crop.cam_from_body, crop.intrinsics, crop.px_per_mm)
-        by_edges = edge_log_odds(measured, o.log_odds)
+        by_edges = edge_log_odds(measured)
         is_base = np.arange(self._count) == self.base
         points = self._meter.found_points(edges, is_base)
-        seen = np.where(is_base, 0.0, np.clip(-by_edges, 0.0, o.max_seen))
+        seen = np.where(is_base, 0.0, np.clip(-by_edges, 0.0, MAX_SEEN))
         return TurnEvidence(seen, float(np.mean(points.is_found)) if len(points.is_found) else 0.0)
 
     def motion_px(self, before: Array | None, cam_from_model: Array) -> float:
@@ -234,7 +214,7 @@ class ComponentObserver:
         if before is None:
             return 0.0
         px_per_mm = self._camera.fx / max(float(apply(cam_from_model, self._model_from_body[:3, 3])[2]), 1.0)
-        shrink = max(1, round(self._diameter_mm * px_per_mm / self._options.max_part_px))
+        shrink = max(1, round(self._diameter_mm * px_per_mm / MAX_PART_PX))
         moved_mm = apply(cam_from_model, self._corners_in_model) - apply(before, self._corners_in_model)
         return float(np.max(np.linalg.norm(moved_mm[:, :2], axis=1))) * px_per_mm / shrink
 
@@ -248,7 +228,7 @@ class ComponentObserver:
         edges = self._visible_edges.nearest(cam_from_model, is_absent)
         if self._shown is None or self._shown[0] is not edges:
             points = np.bincount(edges.component[edges.is_own], minlength=len(edges.starts) - 1)
-            self._shown = edges, np.asarray(points >= self._options.edge_support.points.min_points)
+            self._shown = edges, np.asarray(points >= POINTS.min_points)
         return self._shown[1]
 
     def _network_log_odds(self, picture: PartImage, known: Known, is_exact: NDArray[np.bool_]) -> Array:
@@ -279,13 +259,13 @@ class ComponentObserver:
 
     def _part_crop(self, image: NDArray[np.uint8], cam_from_model: Array) -> PartCrop:
         """The picture around the part, shrunk by a whole factor where it is large."""
-        o, camera = self._options, self._camera
+        camera = self._camera
         cam_from_body = cam_from_model @ self._model_from_body
         px_per_mm = camera.fx / max(float(cam_from_body[2, 3]), 1.0)
-        shrink = max(1, round(self._diameter_mm * px_per_mm / o.max_part_px))
+        shrink = max(1, round(self._diameter_mm * px_per_mm / MAX_PART_PX))
         size = np.array([camera.width, camera.height])
         corners = np.nan_to_num(camera.project(apply(cam_from_model, self._corners_in_model)))
-        margin = o.margin_px * shrink
+        margin = MARGIN_PX * shrink
         low = np.clip(np.floor(corners.min(axis=0) - margin), 0, size - 8 * shrink).astype(int)
         small = (np.clip(np.ceil(corners.max(axis=0) + margin), low + 8 * shrink, size).astype(int) - low) // shrink
         high = low + small * shrink

@@ -10,7 +10,6 @@ among many placements is subtracted (Bonferroni's correction for multiple tests)
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -26,37 +25,30 @@ _NEIGHBOURS = np.array([(x, y) for x in (-1.0, 0.0, 1.0) for y in (-1.0, 0.0, 1.
 """Steps from a placement to those around it, and to itself."""
 
 
-@dataclass(frozen=True)
-class PlacementSearchOptions:
-    """Budget of the search, and weights of its log odds.
-
-    Attributes:
-        kept_per_component: placements of a component that the first refinement starts from.
-        refinement_steps: grid steps of the refinements around the best placements.
-        max_nominal: cap on the log odds against the nominal placement, which are evidence by themselves already.
-        hidden_nominal: log odds that are assumed where the nominal placement is not visible.
-        min_nominal: components with lower log odds against their nominal placement are not searched for.
-        swap_margin: swaps are dropped if their log odds, without mirrored crops, are below the choice cost by more.
-        max_scored: placements of a component that the network scores, those with the best edge responses.
-        max_placements: placements tried in one picture, over all components.
-        max_components: components searched for in one picture, those with most against their nominal placement.
-        outline_px: edges this near to a component's outline count for its edge response.
-        choice_cost: subtracted from the log odds for having chosen among many placements.
-        slope: weight of the remaining log odds.
-    """
-
-    kept_per_component: int = 2
-    refinement_steps: tuple[float, ...] = (0.5, 0.25)
-    max_nominal: float = 1.5
-    hidden_nominal: float = -0.5
-    min_nominal: float = -2.5
-    swap_margin: float = 1.0
-    max_scored: int = 10
-    max_placements: int = 800
-    max_components: int = 20
-    outline_px: float = 1.5
-    choice_cost: float = 2.5
-    slope: float = 2.0
+KEPT_PER_COMPONENT = 2
+"""Placements of a component that the first refinement starts from."""
+REFINEMENT_STEPS: tuple[float, ...] = (0.5, 0.25)
+"""Grid steps of the refinements around the best placements."""
+MAX_NOMINAL = 1.5
+"""Cap on the log odds against the nominal placement, which are evidence by themselves already."""
+HIDDEN_NOMINAL = -0.5
+"""Log odds that are assumed where the nominal placement is not visible."""
+MIN_NOMINAL = -2.5
+"""Components with lower log odds against their nominal placement are not searched for."""
+SWAP_MARGIN = 1.0
+"""Swaps are dropped if their log odds, without mirrored crops, are below the choice cost by more."""
+MAX_SCORED = 10
+"""Placements of a component that the network scores, those with the best edge responses."""
+MAX_PLACEMENTS = 800
+"""Placements tried in one picture, over all components."""
+MAX_COMPONENTS = 20
+"""Components searched for in one picture, those with most against their nominal placement."""
+OUTLINE_PX = 1.5
+"""Edges this near to a component's outline count for its edge response."""
+CHOICE_COST = 2.5
+"""Subtracted from the log odds for having chosen among many placements."""
+SLOPE = 2.0
+"""Weight of the remaining log odds."""
 
 
 class Alternatives(NamedTuple):
@@ -94,7 +86,6 @@ class PlacementSearch:
         surface: of the part, about its centre.
         diameter_mm: of the part.
         network: predicts whether a component is at a placement.
-        options: see `PlacementSearchOptions`.
     """
 
     def __init__(
@@ -103,11 +94,9 @@ class PlacementSearch:
         surface: Surface,
         diameter_mm: float,
         network: PresenceNet,
-        options: PlacementSearchOptions | None = None,
     ) -> None:
         self._placements, self._diameter_mm, self._network = placements, diameter_mm, network
         self._surface, self._starts = _by_component(surface, len(placements.shifts))
-        self._options = options or PlacementSearchOptions()
 
     def search(self, picture: PartImage, nominal: Array, is_searched: NDArray[np.bool_]) -> Alternatives:
         """The best alternative placements.
@@ -117,12 +106,11 @@ class PlacementSearch:
             nominal: (C,) the network's log odds against the nominal placements, NaN where these are not visible.
             is_searched: (C,) components that are searched for.
         """
-        o = self._options
-        nominal = np.where(np.isnan(nominal), o.hidden_nominal, np.minimum(nominal, o.max_nominal))
-        searched = self._affordable(np.flatnonzero(is_searched & (nominal > o.min_nominal)), nominal)
+        nominal = np.where(np.isnan(nominal), HIDDEN_NOMINAL, np.minimum(nominal, MAX_NOMINAL))
+        searched = self._affordable(np.flatnonzero(is_searched & (nominal > MIN_NOMINAL)), nominal)
         placements = [_Placement(index, shift) for index in searched for shift in self._placements.shifts[index]]
-        found = self._best(placements, picture, o.kept_per_component)
-        for step in o.refinement_steps:
+        found = self._best(placements, picture, KEPT_PER_COMPONENT)
+        for step in REFINEMENT_STEPS:
             placements = [
                 _Placement(one.component, one.shift + step * self._placements.step_mm * neighbour @ along_base)
                 for one in found
@@ -138,13 +126,13 @@ class PlacementSearch:
             shifts[one.component] = one.shift
         swaps = [swap for swap in self._placements.swaps if swap.first in searched and swap.second in searched]
         swap_log_odds = self._swap_log_odds(swaps, nominal, picture, is_mirrored=False)
-        is_likely = swap_log_odds > o.choice_cost - o.swap_margin
+        is_likely = swap_log_odds > CHOICE_COST - SWAP_MARGIN
         swaps = [swap for swap, likely in zip(swaps, is_likely, strict=True) if likely]
         for swap, log_odds in zip(swaps, self._swap_log_odds(swaps, nominal, picture), strict=True):
             for component, shift in ((swap.first, swap.shift), (swap.second, -swap.shift)):
                 if log_odds > alternative[component]:
                     alternative[component], shifts[component] = log_odds, shift
-        return Alternatives(np.asarray(o.slope * (alternative - o.choice_cost)), shifts)
+        return Alternatives(np.asarray(SLOPE * (alternative - CHOICE_COST)), shifts)
 
     def _swap_log_odds(self, swaps: list[Swap], nominal: Array, picture: PartImage, is_mirrored: bool = True) -> Array:
         """Log odds (N,) that pairs of components are swapped: of each one in the other's place."""
@@ -161,9 +149,9 @@ class PlacementSearch:
     def _affordable(self, indices: NDArray[np.intp], nominal: Array) -> list[int]:
         """Those of some components with most against their nominal placement, as many as the budget allows."""
         in_order = indices[np.argsort(-nominal[indices], kind="stable")]
-        in_order = in_order[: self._options.max_components]
+        in_order = in_order[:MAX_COMPONENTS]
         counts = np.cumsum([len(self._placements.shifts[index]) for index in in_order])
-        affordable = int(np.searchsorted(counts, self._options.max_placements, side="right"))
+        affordable = int(np.searchsorted(counts, MAX_PLACEMENTS, side="right"))
         return sorted(in_order[: max(1, affordable)].tolist())
 
     def _best(self, placements: list[_Placement], picture: PartImage, kept: int = 1) -> list[_Placement]:
@@ -171,7 +159,7 @@ class PlacementSearch:
         scored = [_Scored(one, crop) for one in placements if (crop := self._crop(one, picture)) is not None]
         responses = np.array([self._edge_response(crop) for _, crop in scored])
         in_order = [scored[k] for k in np.argsort(-responses, kind="stable")]
-        scored = _first_of_each(in_order, self._options.max_scored)
+        scored = _first_of_each(in_order, MAX_SCORED)
         log_odds = self._network.log_odds([crop for _, crop in scored], is_mirrored=False)
         return [one for one, _ in _first_of_each([scored[k] for k in np.argsort(log_odds)], kept)]
 
@@ -203,7 +191,7 @@ class PlacementSearch:
 
     def _edge_response(self, crop: ComponentCrop) -> float:
         """Mean response, 0–255, of the edge network along a component's drawn edges."""
-        edges = np.where(crop.drawn[0] < self._options.outline_px / BAND_PX, crop.drawn[1], 0.0)
+        edges = np.where(crop.drawn[0] < OUTLINE_PX / BAND_PX, crop.drawn[1], 0.0)
         return float(np.sum(edges * crop.edge_responses[0]) / max(float(np.sum(edges)), 1.0))
 
 

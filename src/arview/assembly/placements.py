@@ -16,37 +16,29 @@ from arview.cad.model import Model
 from arview.cad.samples import Samples, sample_surface
 from arview.geometry import Array
 
-
-@dataclass(frozen=True)
-class PlacementOptions:
-    """When a component is mounted on another, and which placements are tried.
-
-    Attributes:
-        max_samples: samples of a component's surface.
-        spacing_share: their distance, in diameters of the part.
-        touch_share: distance, in diameters of the part, below which surfaces touch.
-        min_touching: share of a component's samples that must touch what it is mounted on.
-        min_flatness: length of the mean normal of the touched surface; 1 is flat. Also the cosine between the normals
-            of two components' bases that can be swapped.
-        reach_mm: largest distance of an alternative placement.
-        reach_share: the same in diameters of the part; the smaller one holds.
-        steps: grid steps up to that distance.
-        min_steps: nearer placements, in steps, cannot be distinguished from the nominal one.
-        overhang_steps: grid steps by which a component may extend beyond its base.
-        clear_share: distance, in diameters of the part, by which it may overlap others.
-    """
-
-    max_samples: int = 4000
-    spacing_share: float = 0.01
-    touch_share: float = 0.004
-    min_touching: float = 0.01
-    min_flatness: float = 0.9
-    reach_mm: float = 30.0
-    reach_share: float = 0.15
-    steps: int = 4
-    min_steps: float = 0.9
-    overhang_steps: float = 0.6
-    clear_share: float = 0.002
+MAX_SAMPLES = 4000
+"""Samples of a component's surface."""
+SPACING_SHARE = 0.01
+"""Their distance, in diameters of the part."""
+TOUCH_SHARE = 0.004
+"""Distance, in diameters of the part, below which surfaces touch."""
+MIN_TOUCHING = 0.01
+"""Share of a component's samples that must touch what it is mounted on."""
+MIN_FLATNESS = 0.9
+"""Length of the mean normal of the touched surface; 1 is flat. Also the cosine between the normals of two components'
+bases that can be swapped."""
+REACH_MM = 30.0
+"""Largest distance of an alternative placement."""
+REACH_SHARE = 0.15
+"""The same in diameters of the part; the smaller one holds."""
+STEPS = 4
+"""Grid steps up to that distance."""
+MIN_STEPS = 0.9
+"""Nearer placements, in steps, cannot be distinguished from the nominal one."""
+OVERHANG_STEPS = 0.6
+"""Grid steps by which a component may extend beyond its base."""
+CLEAR_SHARE = 0.002
+"""Distance, in diameters of the part, by which it may overlap others."""
 
 
 class Swap(NamedTuple):
@@ -74,21 +66,20 @@ class Placements:
     swaps: tuple[Swap, ...]
 
 
-def alternative_placements(model: Model, options: PlacementOptions | None = None) -> Placements:
+def alternative_placements(model: Model) -> Placements:
     """Alternative placements of all components of a model; the largest component, and loose ones, have none."""
-    o = options or PlacementOptions()
     diameter_mm = model.diameter_mm
-    samples = [sample_surface(one, o.spacing_share * diameter_mm, o.max_samples) for one in model.components]
+    samples = [sample_surface(one, SPACING_SHARE * diameter_mm, MAX_SAMPLES) for one in model.components]
     areas = [float(face_areas(one.vertices_in_model, one.faces.astype(np.int64)).sum()) for one in model.components]
-    step_mm = min(o.reach_mm, o.reach_share * diameter_mm) / o.steps
-    axis = step_mm * np.arange(-o.steps, o.steps + 1)
+    step_mm = min(REACH_MM, REACH_SHARE * diameter_mm) / STEPS
+    axis = step_mm * np.arange(-STEPS, STEPS + 1)
     grid = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
     distance = np.linalg.norm(grid, axis=1)
-    grid = grid[(distance >= o.min_steps * step_mm) & (distance <= axis[-1])]
+    grid = grid[(distance >= MIN_STEPS * step_mm) & (distance <= axis[-1])]
     shifts, along_base, feet = [], [], []
-    mounted = [_base_of(index, model, samples, areas, o) for index in range(len(model.components))]
+    mounted = [_base_of(index, model, samples, areas) for index in range(len(model.components))]
     corners = [one.vertices_in_model[np.unique(one.faces)] for one in model.components]
-    overhang_mm, clear_mm = o.overhang_steps * step_mm, o.clear_share * diameter_mm
+    overhang_mm, clear_mm = OVERHANG_STEPS * step_mm, CLEAR_SHARE * diameter_mm
     for index, (base, normal) in enumerate(mounted):
         frame = np.linalg.svd(normal[None])[2]
         frame[0] = normal
@@ -101,18 +92,15 @@ def alternative_placements(model: Model, options: PlacementOptions | None = None
     swaps = [
         Swap(one, other, feet[other] - feet[one])
         for one, other in combinations(range(len(mounted)), 2)
-        if mounted[one][0] == mounted[other][0] >= 0 and mounted[one][1] @ mounted[other][1] > o.min_flatness
+        if mounted[one][0] == mounted[other][0] >= 0 and mounted[one][1] @ mounted[other][1] > MIN_FLATNESS
     ]
     return Placements(tuple(shifts), tuple(along_base), step_mm, tuple(swaps))
 
 
-def _base_of(
-    index: int, model: Model, samples: Sequence[Samples], areas: Sequence[float], options: PlacementOptions
-) -> tuple[int, Array]:
+def _base_of(index: int, model: Model, samples: Sequence[Samples], areas: Sequence[float]) -> tuple[int, Array]:
     """The larger component that one touches most, -1 if none, and the normal (3,) of its surface there."""
-    o = options
-    touch_mm, spacing_mm = o.touch_share * model.diameter_mm, 2.0 * o.spacing_share * model.diameter_mm
-    points, found, max_touching = samples[index].points, (-1, np.array([0.0, 0.0, 1.0])), o.min_touching
+    touch_mm, spacing_mm = TOUCH_SHARE * model.diameter_mm, 2.0 * SPACING_SHARE * model.diameter_mm
+    points, found, max_touching = samples[index].points, (-1, np.array([0.0, 0.0, 1.0])), MIN_TOUCHING
     if len(points) == 0:
         return found
     low, high = points.min(axis=0) - touch_mm, points.max(axis=0) + touch_mm
@@ -129,7 +117,7 @@ def _base_of(
         touches = (distance < spacing_mm) & (gaps < touch_mm)
         if np.mean(touches) > max_touching:
             mean = normals[touches].mean(axis=0)
-            if np.linalg.norm(mean) > o.min_flatness:
+            if np.linalg.norm(mean) > MIN_FLATNESS:
                 found, max_touching = (other, mean / np.linalg.norm(mean)), float(np.mean(touches))
     return found
 

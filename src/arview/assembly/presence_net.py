@@ -38,29 +38,22 @@ MIRRORS = ((False, False), (True, False), (False, True), (True, True))
 """Test-time augmentation: (left for right, top for bottom) of the crops whose log odds are averaged."""
 
 
-@dataclass(frozen=True)
-class ComponentCropOptions:
-    """How components are cut out for the network, which was fitted to crops made with these values.
-
-    Attributes:
-        radius_px: half of the component's larger side in the crop.
-        min_pixels: visible pixels of a component in the crop; with fewer the network does not predict.
-        min_source_px: smallest side of the cut-out piece of the picture.
-        max_source_share: largest side of it, as a multiple of the picture's larger side.
-        near_share: components nearer to the camera than this share of the part's diameter are left out.
-        depth_jump: jump in depth that is drawn as an edge, in half diameters of the part.
-        turn_cos: normals that turn by more than 30° are drawn as an edge too.
-        typical_size_px: size in the picture that the network's input of it is relative to.
-    """
-
-    radius_px: float = 13.0
-    min_pixels: int = 40
-    min_source_px: int = 10
-    max_source_share: float = 1.6
-    near_share: float = 0.1
-    depth_jump: float = 0.03
-    turn_cos: float = 0.866
-    typical_size_px: float = 30.0
+RADIUS_PX = 13.0
+"""Half of the component's larger side in the crop."""
+MIN_PIXELS = 40
+"""Visible pixels of a component in the crop; with fewer the network does not predict."""
+MIN_SOURCE_PX = 10
+"""Smallest side of the cut-out piece of the picture."""
+MAX_SOURCE_SHARE = 1.6
+"""Largest side of it, as a multiple of the picture's larger side."""
+NEAR_SHARE = 0.1
+"""Components nearer to the camera than this share of the part's diameter are left out."""
+DEPTH_JUMP = 0.03
+"""Jump in depth that is drawn as an edge, in half diameters of the part."""
+TURN_COS = 0.866
+"""Normals that turn by more than 30° are drawn as an edge too."""
+TYPICAL_SIZE_PX = 30.0
+"""Size in the picture that the network's input of it is relative to."""
 
 
 class PartImage(NamedTuple):
@@ -118,11 +111,9 @@ def network_input(crop: ComponentCrop) -> NetworkInput:
     return NetworkInput(append_edge_responses(channels, crop.edge_responses), scalars)
 
 
-def global_inputs(
-    size_px: float, contrast: float, explained: float, options: ComponentCropOptions | None = None
-) -> NDArray[np.float32]:
+def global_inputs(size_px: float, contrast: float, explained: float) -> NDArray[np.float32]:
     """The network's inputs about the crop as a whole (GLOBALS,): see there."""
-    typical_px = (options or ComponentCropOptions()).typical_size_px
+    typical_px = TYPICAL_SIZE_PX
     return np.array([*size_and_contrast(size_px / typical_px, contrast), explained], dtype=np.float32)
 
 
@@ -131,7 +122,6 @@ def component_crops(
     surface: Surface,
     diameter_mm: float,
     only: Sequence[int] | None = None,
-    options: ComponentCropOptions | None = None,
 ) -> list[ComponentCrop]:
     """Crops of the components of which enough is visible.
 
@@ -140,15 +130,13 @@ def component_crops(
         surface: of the part, about its centre.
         diameter_mm: of the part.
         only: indices of the components to cut out; None: all.
-        options: see `ComponentCropOptions`.
     """
-    options = options or ComponentCropOptions()
     points = apply(picture.cam_from_body, surface.points.astype(np.float64))
     crops = []
     for index in range(int(surface.component.max()) + 1) if only is None else only:
         own = points[np.unique(surface.faces[surface.component == index])]
-        if len(own) and own[:, 2].min() > options.near_share * diameter_mm:
-            crop = _crop(index, own, picture, surface, diameter_mm, options)
+        if len(own) and own[:, 2].min() > NEAR_SHARE * diameter_mm:
+            crop = _crop(index, own, picture, surface, diameter_mm)
             if crop is not None:
                 crops.append(crop)
     return crops
@@ -160,7 +148,6 @@ def _crop(
     picture: PartImage,
     surface: Surface,
     diameter_mm: float,
-    options: ComponentCropOptions,
 ) -> ComponentCrop | None:
     """Crop of a component with some points (N,3); None where too little of it is visible."""
     intrinsics, cam_from_body = picture.intrinsics, picture.cam_from_body
@@ -173,8 +160,8 @@ def _crop(
     )
     low, high = ideal.min(axis=0) + displaced, ideal.max(axis=0) + displaced
     size_px = float(np.max(high - low))
-    side = max(options.min_source_px, round(size_px * SIDE_PX / (2.0 * options.radius_px)))
-    if side > options.max_source_share * max(picture.image.shape[:2]):
+    side = max(MIN_SOURCE_PX, round(size_px * SIDE_PX / (2.0 * RADIUS_PX)))
+    if side > MAX_SOURCE_SHARE * max(picture.image.shape[:2]):
         return None
     corner = np.round(0.5 * (low + high) - 0.5 * (side - 1)).astype(int)
     zoom = SIDE_PX / side
@@ -187,11 +174,11 @@ def _crop(
     )
     owners = np.where(face_ids >= 0, surface.component[face_ids], -1)
     is_own = (owners == index).astype(np.uint8)
-    if np.count_nonzero(is_own) < options.min_pixels:
+    if np.count_nonzero(is_own) < MIN_PIXELS:
         return None
     outside, inside = (cv2.distanceTransform(mask, cv2.DIST_L2, 3) - 0.5 for mask in (1 - is_own, is_own))
     drawn[0] = np.clip(np.where(is_own, -inside, outside) / BAND_PX, -1.0, 1.0)
-    drawn[1] = _drawn_edges(drawn[2:], owners, options)
+    drawn[1] = _drawn_edges(drawn[2:], owners)
     # Depths are relative to the component's own.
     middle, scale = np.median(drawn[5][is_own > 0]), diameter_mm / float(np.max(np.ptp(points_in_cam, axis=0)))
     drawn[5] = np.where(face_ids >= 0, np.clip(scale * (drawn[5] - middle), -1.0, 1.0), 0.0)
@@ -201,15 +188,13 @@ def _crop(
     return ComponentCrop(index, _cut(picture.image, corner, side), drawn, responses, size_px)
 
 
-def _drawn_edges(
-    surface: NDArray[np.float32], owners: NDArray[np.int16], options: ComponentCropOptions
-) -> NDArray[np.float32]:
+def _drawn_edges(surface: NDArray[np.float32], owners: NDArray[np.int16]) -> NDArray[np.float32]:
     """1 on edges of what is drawn (S,S), fading beside them: borders of components, jumps in depth, sharp turns."""
     is_edge = np.zeros(owners.shape, dtype=np.float32)
     for before, after in ((np.s_[..., :-1, :], np.s_[..., 1:, :]), (np.s_[..., :-1], np.s_[..., 1:])):
         one, other = surface[before], surface[after]
-        turns = np.sum(one[:3] * other[:3], axis=0) < options.turn_cos
-        is_line = (owners[before] != owners[after]) | turns | (np.abs(one[3] - other[3]) > options.depth_jump)
+        turns = np.sum(one[:3] * other[:3], axis=0) < TURN_COS
+        is_line = (owners[before] != owners[after]) | turns | (np.abs(one[3] - other[3]) > DEPTH_JUMP)
         is_edge[before] = np.maximum(is_edge[before], is_line)
         is_edge[after] = np.maximum(is_edge[after], is_line)
     return np.asarray(cv2.GaussianBlur(is_edge, (3, 3), 0.7))

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,24 +20,16 @@ from arview.cad.samples import sample_surface
 from arview.geometry import Array, invert
 from arview.refinement.view_model import PartView
 
-
-@dataclass(frozen=True)
-class PresentLinesOptions:
-    """Which points are replaced.
-
-    Attributes:
-        spacing_share: distance of samples of an absent component's surface, in diameters of the part.
-        near_share: points nearer to such a sample, in diameters of the part, are the component's.
-        max_samples: largest number of samples of a component.
-        min_left: share of a view's points that must be left; of other views none is replaced.
-        reach_deg: angle between the present direction and those of views that are changed.
-    """
-
-    spacing_share: float = 0.01
-    near_share: float = 0.008
-    max_samples: int = 4000
-    min_left: float = 0.15
-    reach_deg: float = 9.0
+SPACING_SHARE = 0.01
+"""Distance of samples of an absent component's surface, in diameters of the part."""
+NEAR_SHARE = 0.008
+"""Points nearer to such a sample, in diameters of the part, are the component's."""
+MAX_SAMPLES = 4000
+"""Largest number of samples of a component."""
+MIN_LEFT = 0.15
+"""Share of a view's points that must be left; of other views none is replaced."""
+REACH_DEG = 9.0
+"""Angle between the present direction and those of views that are changed."""
 
 
 class PresentLines:
@@ -48,11 +39,9 @@ class PresentLines:
         model: of the part.
         part: its guide views; they are not changed.
         base: index of the component that carries the others.
-        options: see `PresentLinesOptions`.
     """
 
-    def __init__(self, model: Model, part: PartView, base: int, options: PresentLinesOptions | None = None) -> None:
-        self._options = options or PresentLinesOptions()
+    def __init__(self, model: Model, part: PartView, base: int) -> None:
         self._model, self._whole = model, part
         self._reduced: PartView | None = None
         self._is_absent = np.zeros(len(model.components), dtype=bool)
@@ -91,7 +80,7 @@ class PresentLines:
         center = self._whole.model_from_body[:3, 3]
         direction = invert(cam_from_model)[:3, 3] - center
         cosines = self._whole.arrays.directions @ (direction / np.linalg.norm(direction))
-        near = np.flatnonzero(cosines > np.cos(np.deg2rad(self._options.reach_deg))).tolist()
+        near = np.flatnonzero(cosines > np.cos(np.deg2rad(REACH_DEG))).tolist()
         self._change([view for view in near if view not in self._changed])
         return self._reduced
 
@@ -107,10 +96,10 @@ class PresentLines:
         self._changed.clear()
         self._tree = None
         if self._is_absent.any():
-            o, model = self._options, self._model
-            spacing_mm = o.spacing_share * model.diameter_mm
+            model = self._model
+            spacing_mm = SPACING_SHARE * model.diameter_mm
             samples = [
-                sample_surface(model.components[c], spacing_mm, o.max_samples).points
+                sample_surface(model.components[c], spacing_mm, MAX_SAMPLES).points
                 for c in np.flatnonzero(self._is_absent)
             ]
             self._tree = cKDTree(np.concatenate(samples) - self._whole.model_from_body[:3, 3])
@@ -118,8 +107,8 @@ class PresentLines:
     def _change(self, views: Sequence[int]) -> None:
         """Replace the points of absent components in some views."""
         assert self._tree is not None and self._reduced is not None
-        o, whole, reduced = self._options, self._whole.arrays, self._reduced.arrays
-        near_mm = o.near_share * self._model.diameter_mm
+        whole, reduced = self._whole.arrays, self._reduced.arrays
+        near_mm = NEAR_SHARE * self._model.diameter_mm
         for view in views:
             self._changed.add(view)
             for starts, names in _LINES:
@@ -129,7 +118,7 @@ class PresentLines:
                     continue
                 distance = self._tree.query(points, distance_upper_bound=near_mm)[0]
                 left = np.flatnonzero(np.isinf(distance))
-                if len(left) == len(points) or len(left) < o.min_left * len(points):
+                if len(left) == len(points) or len(left) < MIN_LEFT * len(points):
                     continue
                 chosen = first + left[np.arange(len(points)) * len(left) // len(points)]
                 for name in names:

@@ -9,7 +9,6 @@ nothing: any number may be absent. Two that change places say nothing either: ea
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
@@ -21,36 +20,27 @@ from arview.cad.model import Component
 from arview.cad.samples import sample_surface
 from arview.geometry import Array, apply, exp_so3, rigid
 
-
-@dataclass(frozen=True)
-class TurnedPoseOptions:
-    """Which poses are alternatives, and when one is better.
-
-    Attributes:
-        max_samples: samples of the surface of the base.
-        same_share: distance in diameters of the base up to which a turned sample lies on its surface.
-        min_same: share of the samples that must.
-        rough_step, rough_margin: every so many-th sample is tried first, and by how much fewer of these may lie there.
-        exact_share: distance in diameters of the base up to which all its corners, turned, lie on corners if the
-            symmetry is exact.
-        base_weight: log odds per share of the base's edge points that are found.
-        max_added: bound on what one observation adds.
-        as_before: log odds for the pose in which the part lies as it did before it was lost for a moment.
-        better: summed log odds from which on a turned pose is better.
-        worse: summed log odds below which it is none.
-    """
-
-    max_samples: int = 3000
-    same_share: float = 0.015
-    min_same: float = 0.9
-    rough_step: int = 12
-    rough_margin: float = 0.15
-    exact_share: float = 0.003
-    base_weight: float = 30.0
-    max_added: float = 4.0
-    as_before: float = 6.0
-    better: float = 5.5
-    worse: float = -3.5
+MAX_SAMPLES = 3000
+"""Samples of the surface of the base."""
+SAME_SHARE = 0.015
+"""Distance in diameters of the base up to which a turned sample lies on its surface."""
+MIN_SAME = 0.9
+"""Share of the samples that must."""
+ROUGH_STEP = 12
+ROUGH_MARGIN = 0.15
+"""Every so many-th sample is tried first, and by how much fewer of these may lie there."""
+EXACT_SHARE = 0.003
+"""Distance in diameters of the base up to which all its corners, turned, lie on corners if the symmetry is exact."""
+BASE_WEIGHT = 30.0
+"""Log odds per share of the base's edge points that are found."""
+MAX_ADDED = 4.0
+"""Bound on what one observation adds."""
+AS_BEFORE = 6.0
+"""Log odds for the pose in which the part lies as it did before it was lost for a moment."""
+BETTER = 5.5
+"""Summed log odds from which on a turned pose is better."""
+WORSE = -3.5
+"""Summed log odds below which it is none."""
 
 
 class TurnEvidence(NamedTuple):
@@ -96,7 +86,6 @@ class TurnedPoses:
     Args:
         components: of the part.
         base: index of the one that carries the others.
-        options: see `TurnedPoseOptions`.
         like: another of the same part, whose turns are shared.
     """
 
@@ -104,10 +93,9 @@ class TurnedPoses:
         self,
         components: Sequence[Component],
         base: int,
-        options: TurnedPoseOptions | None = None,
         like: TurnedPoses | None = None,
     ) -> None:
-        self._options, self._components, self._base = options or TurnedPoseOptions(), components, base
+        self._components, self._base = components, base
         self._like = like
         self._excluded: set[int] = set()
         self._sums: list[float] = []
@@ -117,13 +105,13 @@ class TurnedPoses:
         """All turns; few parts need them."""
         if self._like is not None:
             return self._like.turns
-        return base_turns(self._components, self._base, self._options)
+        return base_turns(self._components, self._base)
 
     @property
     def better(self) -> Turn | None:
         """The turn from the tracked pose to one that is clearly better; None: none is."""
         best = int(np.argmax(self._sums)) if self._sums else 0
-        is_better = bool(self._sums) and self._sums[best] > self._options.better
+        is_better = bool(self._sums) and self._sums[best] > BETTER
         return self.turns[best] if is_better else None
 
     def open_turns(self, is_present: NDArray[np.bool_]) -> list[Turn]:
@@ -172,14 +160,13 @@ class TurnedPoses:
         self._sums = self._sums or [0.0] * len(self.turns)
         if len(self._excluded) == len(self.turns):
             return
-        o = self._options
         here = evidence_at(cam_from_model)
         for k, turn in enumerate(self.turns):
             if k in self._excluded:
                 continue
             there = evidence_at(cam_from_model @ turn.model_from_model)
-            self._sums[k] += float(np.clip(self._gain(turn, here, there), -o.max_added, o.max_added))
-            if self._sums[k] <= o.worse:
+            self._sums[k] += float(np.clip(self._gain(turn, here, there), -MAX_ADDED, MAX_ADDED))
+            if self._sums[k] <= WORSE:
                 self._excluded.add(k)
 
     def best(
@@ -200,7 +187,7 @@ class TurnedPoses:
         here = evidence_at(cam_from_model)
         poses = [cam_from_model @ turn.model_from_model for turn in self.turns]
         gains = [self._gain(turn, here, evidence_at(pose)) for turn, pose in zip(self.turns, poses, strict=True)]
-        known = self._options.as_before * np.array([is_as_before(pose) for pose in (cam_from_model, *poses)])
+        known = AS_BEFORE * np.array([is_as_before(pose) for pose in (cam_from_model, *poses)])
         totals = np.array([0.0, *gains]) + known
         return (cam_from_model, *poses)[int(np.argmax(totals))]
 
@@ -208,20 +195,19 @@ class TurnedPoses:
         """Log odds of a turned pose to the tracked one by what is seen in both."""
         is_against, is_for = turn.unmatched()
         gain = float(there.seen[is_for].sum() - here.seen[is_against].sum())
-        return gain if turn.is_exact else gain + self._options.base_weight * (there.base - here.base)
+        return gain if turn.is_exact else gain + BASE_WEIGHT * (there.base - here.base)
 
 
-def base_turns(components: Sequence[Component], base: int, options: TurnedPoseOptions | None = None) -> list[Turn]:
+def base_turns(components: Sequence[Component], base: int) -> list[Turn]:
     """Rotations by 90° and 180° after which most of the base's surface lies on itself, and what else they move."""
-    o = options or TurnedPoseOptions()
     carrier = components[base]
     diameter_mm = float(np.linalg.norm(np.ptp(carrier.bounds_in_model, axis=0)))
-    points = sample_surface(carrier, 0.01 * diameter_mm, o.max_samples).points
+    points = sample_surface(carrier, 0.01 * diameter_mm, MAX_SAMPLES).points
     center = carrier.bounds_in_model.mean(axis=0)
     tree, corners = cKDTree(points), cKDTree(carrier.vertices_in_model)
-    near_mm = max(o.same_share * diameter_mm, 2.0 * float(np.median(tree.query(points, k=2)[0][:, 1])))
+    near_mm = max(SAME_SHARE * diameter_mm, 2.0 * float(np.median(tree.query(points, k=2)[0][:, 1])))
     principal = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
-    surfaces = _Surfaces(components, 0.5 * near_mm, o.max_samples)
+    surfaces = _Surfaces(components, 0.5 * near_mm, MAX_SAMPLES)
     found: list[Turn] = []
     for axis in (*np.eye(3), *principal):
         for quarter in (2, 1, 3):
@@ -230,13 +216,13 @@ def base_turns(components: Sequence[Component], base: int, options: TurnedPoseOp
                 continue
             turned = rigid(rotation, center - rotation @ center)
             # Some of the samples show soon that most turns are none.
-            if _same_share(tree, apply(turned, points[:: o.rough_step]), near_mm) < o.min_same - o.rough_margin:
+            if _same_share(tree, apply(turned, points[::ROUGH_STEP]), near_mm) < MIN_SAME - ROUGH_MARGIN:
                 continue
-            if _same_share(tree, apply(turned, points), near_mm) < o.min_same:
+            if _same_share(tree, apply(turned, points), near_mm) < MIN_SAME:
                 continue
             off_mm = float(corners.query(apply(turned, carrier.vertices_in_model))[0].max())
-            counterparts = surfaces.counterparts(turned, near_mm, o.min_same)
-            found.append(Turn(turned, counterparts, off_mm < o.exact_share * diameter_mm))
+            counterparts = surfaces.counterparts(turned, near_mm, MIN_SAME)
+            found.append(Turn(turned, counterparts, off_mm < EXACT_SHARE * diameter_mm))
     return found
 
 

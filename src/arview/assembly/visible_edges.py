@@ -6,7 +6,7 @@ few directions again and again. Points where another component could be mistaken
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,25 +26,18 @@ MIN_FORESHORTENING = 0.05
 """Edges whose image is shorter than this share of their length seen frontally have no stable image direction."""
 
 
-@dataclass(frozen=True)
-class VisibleEdgeOptions:
-    """Which edge points are evidence for their component alone.
-
-    Attributes:
-        shared_px: points this near to a parallel edge of another component are shared, and evidence for neither.
-        shared_cos: edges are parallel when the cosine between their normals is above this.
-        occluder_px: points this near to a surface in front of them may be hidden from directions between two views.
-        side_px: distance from an edge at which the component beside it is looked up.
-        tolerance_px: depth tolerance in pixels; three are two pixels of a surface seen at 45°.
-        max_cached: directions kept in memory.
-    """
-
-    shared_px: float = 3.0
-    shared_cos: float = 0.87
-    occluder_px: int = 2
-    side_px: float = 4.0
-    tolerance_px: float = 3.0
-    max_cached: int = 64
+SHARED_PX = 3.0
+"""Points this near to a parallel edge of another component are shared, and evidence for neither."""
+SHARED_COS = 0.87
+"""Edges are parallel when the cosine between their normals is above this."""
+OCCLUDER_PX = 2
+"""Points this near to a surface in front of them may be hidden from directions between two views."""
+SIDE_PX = 4.0
+"""Distance from an edge at which the component beside it is looked up."""
+TOLERANCE_PX = 3.0
+"""Depth tolerance in pixels; three are two pixels of a surface seen at 45°."""
+MAX_CACHED = 64
+"""Directions kept in memory."""
 
 
 class VisibleEdges(NamedTuple):
@@ -108,11 +101,9 @@ class VisibleEdgeCache:
     Args:
         views: guide views of the model; their directions and camera are used.
         model: the same model.
-        options: see `VisibleEdgeOptions`.
     """
 
-    def __init__(self, views: GuideViewSet, model: Model, options: VisibleEdgeOptions | None = None) -> None:
-        self.options = options or VisibleEdgeOptions()
+    def __init__(self, views: GuideViewSet, model: Model) -> None:
         self._views, self._model = views, model
         self._count = len(model.components)
         self._renderer = ZBufferRenderer(model, views.camera)
@@ -135,7 +126,7 @@ class VisibleEdgeCache:
         absent = is_absent.tobytes() if is_absent is not None and is_absent.any() else b""
         key = (index, absent)
         if key not in self._cached:
-            if len(self._cached) >= self.options.max_cached:
+            if len(self._cached) >= MAX_CACHED:
                 del self._cached[next(iter(self._cached))]
             pose = self._views.poses[index]
             if is_absent is None or not absent:
@@ -156,9 +147,11 @@ class VisibleEdgeCache:
         drawn = renderer.render(view_pose)
         is_kept = ~is_absent[mesh.component]
         left = mesh._replace(
-            ends=mesh.ends[is_kept], faces=mesh.faces[is_kept], is_sharp=mesh.is_sharp[is_kept],
+            ends=mesh.ends[is_kept],
+            faces=mesh.faces[is_kept],
+            is_sharp=mesh.is_sharp[is_kept],
             component=mesh.component[is_kept],
-        )  # fmt: skip
+        )
         found = self._sampled(view_pose, replace(drawn, component_ids=names[drawn.component_ids]), left)
         is_own = is_absent[complete.component]
         component = np.concatenate([found.component, complete.component[is_own]])
@@ -177,14 +170,14 @@ class VisibleEdgeCache:
         return np.searchsorted(component, np.arange(self._count + 1)).astype(np.int64)
 
     def _sampled(self, cam_from_model: Array, image: Rendering, mesh: _Mesh) -> VisibleEdges:
-        o, camera, center_in_model = self.options, self._views.camera, self._views.center_in_model
+        camera, center_in_model = self._views.camera, self._views.center_in_model
         ids = image.component_ids
-        tolerance_mm = o.tolerance_px * float(apply(cam_from_model, center_in_model)[2]) / camera.fx
+        tolerance_mm = TOLERANCE_PX * float(apply(cam_from_model, center_in_model)[2]) / camera.fx
         rendering = _Rendering(cam_from_model, camera.fx, camera.cx, ids, image.depth_mm, tolerance_mm)
         samples = _sample_edges(mesh, rendering)
         order = np.argsort(samples.component, kind="stable")
-        is_own = _own_samples(samples, rendering, o.shared_px, o.shared_cos, o.occluder_px)
-        beside = [np.round(samples.pixels + sign * o.side_px * samples.normals_px).astype(np.intp) for sign in (-1, 1)]
+        is_own = _own_samples(samples, rendering, SHARED_PX, SHARED_COS, OCCLUDER_PX)
+        beside = [np.round(samples.pixels + sign * SIDE_PX * samples.normals_px).astype(np.intp) for sign in (-1, 1)]
         beside = [np.clip(place, 0, [camera.width - 1, camera.height - 1]) for place in beside]
         component = samples.component[order]
         return VisibleEdges(
@@ -297,10 +290,10 @@ def _sample_edges(mesh: _Mesh, view: _Rendering) -> _Samples:
 @kernel
 def _own_samples(
     samples: _Samples, view: _Rendering, shared_px: float, shared_cos: float, occluder_px: int
-) -> NDArray[np.bool_]:  # fmt: skip
+) -> NDArray[np.bool_]:
     """(N,) False for samples near a parallel edge of another component, or near a surface in front of them.
 
-    See `VisibleEdgeOptions` for the limits.
+    The limits are the constants of this module.
     """
     pixels, normals_px, depths, owners = samples.pixels, samples.normals_px, samples.depths, samples.component
     ids, depth = view.ids, view.depth_mm

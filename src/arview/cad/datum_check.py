@@ -12,28 +12,20 @@ from arview.cad.model import Component
 from arview.cad.part import Datum, Part
 from arview.geometry import Array
 
-
-@dataclass(frozen=True)
-class DatumCheckOptions:
-    """Tolerances between a declared datum and the geometry.
-
-    Attributes:
-        sharp_deg: angle between faces from which their common edge is a rim.
-        min_corners: vertices that a rim has at least.
-        round_share: largest deviation of the vertices of a rim from a circle, of its radius.
-        axis_deg: largest angle between declared and actual direction.
-        radius_share: largest difference of radii, of the declared one.
-        place_share: largest distance of the declared point from the axis, of the radius.
-        place_mm: largest distance of the declared point from a plane, and a share that is added to the others.
-    """
-
-    sharp_deg: float = 25.0
-    min_corners: int = 6
-    round_share: float = 0.02
-    axis_deg: float = 5.0
-    radius_share: float = 0.05
-    place_share: float = 0.25
-    place_mm: float = 0.2
+SHARP_DEG = 25.0
+"""Angle between faces from which their common edge is a rim."""
+MIN_CORNERS = 6
+"""Vertices that a rim has at least."""
+ROUND_SHARE = 0.02
+"""Largest deviation of the vertices of a rim from a circle, of its radius."""
+AXIS_DEG = 5.0
+"""Largest angle between declared and actual direction."""
+RADIUS_SHARE = 0.05
+"""Largest difference of radii, of the declared one."""
+PLACE_SHARE = 0.25
+"""Largest distance of the declared point from the axis, of the radius."""
+PLACE_MM = 0.2
+"""Largest distance of the declared point from a plane, and a share that is added to the others."""
 
 
 @dataclass(frozen=True)
@@ -45,9 +37,8 @@ class RoundEdge:
     radius_mm: float
 
 
-def datum_problems(part: Part, options: DatumCheckOptions | None = None) -> list[str]:
+def datum_problems(part: Part) -> list[str]:
     """A text for each datum plane, hole, pin or cylinder that is not where the part file has it."""
-    options = options or DatumCheckOptions()
     rims: dict[str, list[RoundEdge]] = {}
     texts = []
     names = {component.name for component in part.model.components}
@@ -57,10 +48,10 @@ def datum_problems(part: Part, options: DatumCheckOptions | None = None) -> list
         component = part.model.component(datum.component)
         if datum.feature in ("hole", "pin", "cylinder"):
             if datum.component not in rims:
-                rims[datum.component] = find_rims(component, options)
-            text = _round_problem(datum, rims[datum.component], options)
+                rims[datum.component] = find_rims(component)
+            text = _round_problem(datum, rims[datum.component])
         elif datum.feature == "plane":
-            text = _plane_problem(datum, component, options)
+            text = _plane_problem(datum, component)
         else:
             continue
         if text:
@@ -68,14 +59,13 @@ def datum_problems(part: Part, options: DatumCheckOptions | None = None) -> list
     return texts
 
 
-def find_rims(component: Component, options: DatumCheckOptions | None = None) -> list[RoundEdge]:
+def find_rims(component: Component) -> list[RoundEdge]:
     """The round edges of a component: closed loops of sharp edges whose vertices lie on a circle."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
-    options = options or DatumCheckOptions()
     vertices = component.vertices_in_model
-    edges = _sharp_edges(vertices, component.faces.astype(np.int64), options.sharp_deg)
+    edges = _sharp_edges(vertices, component.faces.astype(np.int64), SHARP_DEG)
     count = len(vertices)
     degree = np.bincount(edges.ravel(), minlength=count)
     graph = coo_matrix((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(count, count))
@@ -85,8 +75,8 @@ def find_rims(component: Component, options: DatumCheckOptions | None = None) ->
     return [
         rim
         for loop in loops
-        if len(loop) >= options.min_corners and np.all(degree[loop] == 2)
-        if (rim := _fitted_rim(vertices[loop], options.round_share)) is not None
+        if len(loop) >= MIN_CORNERS and np.all(degree[loop] == 2)
+        if (rim := _fitted_rim(vertices[loop], ROUND_SHARE)) is not None
     ]
 
 
@@ -122,7 +112,7 @@ def _fitted_rim(points: Array, round_share: float) -> RoundEdge | None:
     return RoundEdge(middle + x * axes[0] + y * axes[1], axes[2], radius)
 
 
-def _round_problem(datum: Datum, rims: list[RoundEdge], options: DatumCheckOptions) -> str:
+def _round_problem(datum: Datum, rims: list[RoundEdge]) -> str:
     point, axis = np.array(datum.point_in_model), np.array(datum.direction_in_model)
     diameter_mm = datum.diameter_mm or 0.0
     radius_mm = 0.5 * diameter_mm
@@ -131,9 +121,9 @@ def _round_problem(datum: Datum, rims: list[RoundEdge], options: DatumCheckOptio
         offset = rim.center_in_model - point
         aside_mm = float(np.linalg.norm(offset - (offset @ axis) * axis))
         is_same = (
-            abs(float(rim.axis_in_model @ axis)) > np.cos(np.deg2rad(options.axis_deg))
-            and abs(rim.radius_mm - radius_mm) <= options.radius_share * radius_mm
-            and aside_mm <= options.place_share * radius_mm + options.place_mm
+            abs(float(rim.axis_in_model @ axis)) > np.cos(np.deg2rad(AXIS_DEG))
+            and abs(rim.radius_mm - radius_mm) <= RADIUS_SHARE * radius_mm
+            and aside_mm <= PLACE_SHARE * radius_mm + PLACE_MM
         )
         if is_same:
             return ""
@@ -145,21 +135,21 @@ def _round_problem(datum: Datum, rims: list[RoundEdge], options: DatumCheckOptio
     return f"{what}; the nearest round edge has ⌀ {2 * nearest.radius_mm:.4g} mm at {_place(nearest.center_in_model)}"
 
 
-def _plane_problem(datum: Datum, component: Component, options: DatumCheckOptions) -> str:
+def _plane_problem(datum: Datum, component: Component) -> str:
     point, normal = np.array(datum.point_in_model), np.array(datum.direction_in_model)
     faces = component.faces.astype(np.int64)
     a, b, c = component.vertices_in_model[faces].transpose(1, 0, 2)
     crossed = np.cross(b - a, c - a)
     crossed /= np.maximum(np.linalg.norm(crossed, axis=1, keepdims=True), 1e-300)
-    is_parallel = np.abs(crossed @ normal) > np.cos(np.deg2rad(options.axis_deg))
+    is_parallel = np.abs(crossed @ normal) > np.cos(np.deg2rad(AXIS_DEG))
     what = f"datum {datum.label}: {datum.component} has no plane at {_place(point)} with normal {_place(normal)}"
     if not is_parallel.any():
         return f"{what}; no face of it is parallel to that"
     heights = np.einsum("ij,j->i", component.vertices_in_model[faces].mean(axis=1) - point, normal)[is_parallel]
-    if np.abs(heights).min() <= options.place_mm:
+    if np.abs(heights).min() <= PLACE_MM:
         return ""
     areas = face_areas(component.vertices_in_model, faces)[is_parallel]
-    near = np.abs(heights) <= np.abs(heights).min() + options.place_mm
+    near = np.abs(heights) <= np.abs(heights).min() + PLACE_MM
     height = float(np.average(heights[near], weights=areas[near]))
     return f"{what}; the nearest is {height:+.4g} mm away along the normal"
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -14,18 +14,10 @@ _SAME_SHARE = 1e-4
 """Largest distance between the vertices of equal shapes, as a share of their diameter."""
 
 
-@dataclass(frozen=True)
-class ShapeSearchOptions:
-    """Effort of the search.
-
-    Attributes:
-        max_faces: triangles of all shapes that are searched, in the order of the part; it takes a second for some
-            thousands of them.
-        max_shapes: shapes that are searched.
-    """
-
-    max_faces: int = 150_000
-    max_shapes: int = 120
+MAX_FACES = 150_000
+"""Triangles of all shapes that are searched, in the order of the part; it takes a second for some thousands of them."""
+MAX_SHAPES = 120
+"""Shapes that are searched."""
 
 
 class ShapeSymmetries:
@@ -35,8 +27,7 @@ class ShapeSymmetries:
         skipped: names of components whose symmetries were not searched.
     """
 
-    def __init__(self, options: ShapeSearchOptions | None = None) -> None:
-        self._options = options or ShapeSearchOptions()
+    def __init__(self) -> None:
         self._known: dict[tuple[int, int], list[tuple[Component, tuple[FoundSymmetry, ...]]]] = {}
         self._shapes = self._faces = 0
         self.skipped: list[str] = []
@@ -50,7 +41,7 @@ class ShapeSymmetries:
                 return tuple(_moved(found, shift) for found in symmetries)
         self._shapes += 1
         self._faces += len(component.faces)
-        if self._shapes > self._options.max_shapes or self._faces > self._options.max_faces:
+        if self._shapes > MAX_SHAPES or self._faces > MAX_FACES:
             self.skipped.append(component.name)
             return ()
         found = find_symmetries(component.vertices_in_model, component.faces.astype(np.int64), near_share=0.0)

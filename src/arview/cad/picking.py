@@ -18,22 +18,14 @@ from arview.cad.part import DatumFeature
 from arview.errors import InputError
 from arview.geometry import Array
 
-
-@dataclass(frozen=True)
-class PickOptions:
-    """What counts as one surface.
-
-    Attributes:
-        flat_deg: largest angle between the normals of a plane's faces.
-        smooth_deg: largest angle between neighbouring faces of a round surface.
-        round_share: largest deviation of the vertices of a round surface from a cylinder, of its radius.
-        near_share: rims and edges this near the point count, of the component's size.
-    """
-
-    flat_deg: float = 0.5
-    smooth_deg: float = 25.0
-    round_share: float = 0.02
-    near_share: float = 0.08
+FLAT_DEG = 0.5
+"""Largest angle between the normals of a plane's faces."""
+SMOOTH_DEG = 25.0
+"""Largest angle between neighbouring faces of a round surface."""
+ROUND_SHARE = 0.02
+"""Largest deviation of the vertices of a round surface from a cylinder, of its radius."""
+NEAR_SHARE = 0.08
+"""Rims and edges this near the point count, of the component's size."""
 
 
 @dataclass(frozen=True)
@@ -57,9 +49,7 @@ class PickedFeature:
     distance_mm: float
 
 
-def pick_features(
-    component: Component, face: int, point_in_model: Array, options: PickOptions | None = None
-) -> list[PickedFeature]:
+def pick_features(component: Component, face: int, point_in_model: Array) -> list[PickedFeature]:
     """The features of a component at a point on one of its faces, the likeliest first.
 
     A rim near the point comes before the face, since a rim is small and a face can be picked anywhere.
@@ -68,28 +58,28 @@ def pick_features(
         component: that was picked.
         face: index of the picked triangle.
         point_in_model: (3,) picked point, mm.
-        options: see `PickOptions`.
 
     Raises:
         InputError: there is no such face.
     """
-    options = options or PickOptions()
     if not 0 <= face < len(component.faces):
         raise InputError(f"{component.name}: no face {face}, it has {len(component.faces)}")
     point = np.asarray(point_in_model, dtype=np.float64)
     vertices, faces = component.vertices_in_model, component.faces.astype(np.int64)
     normals = _normals(vertices, faces)
     neighbours = _neighbours(faces)
-    reach_mm = options.near_share * float(np.linalg.norm(np.ptp(vertices, axis=0)))
+    reach_mm = NEAR_SHARE * float(np.linalg.norm(np.ptp(vertices, axis=0)))
     found = _rims(component, point, reach_mm)
-    flat = _region(face, neighbours, normals, options.flat_deg, normals[face])
-    smooth = _region(face, neighbours, normals, options.smooth_deg, None)
-    cylinder = _cylinder(vertices, faces, normals, smooth, point, options) if len(smooth) > len(flat) else None
+    flat = _region(face, neighbours, normals, FLAT_DEG, normals[face])
+    smooth = _region(face, neighbours, normals, SMOOTH_DEG, None)
+    cylinder = _cylinder(vertices, faces, normals, smooth, point) if len(smooth) > len(flat) else None
     if cylinder is not None:
         found.append(cylinder)
     else:
         found.append(_plane(vertices, faces, normals, flat, face, point))
-    edge = _edge(vertices, faces, neighbours, normals, flat, point, reach_mm, options.smooth_deg)
+    edge = _edge(
+        vertices, faces, neighbours, normals=normals, flat=flat, point=point, reach_mm=reach_mm, sharp_deg=SMOOTH_DEG
+    )
     if edge is not None:
         found.append(edge)
     return found
@@ -154,7 +144,6 @@ def _cylinder(
     normals: Array,
     smooth: NDArray[np.int64],
     point: Array,
-    options: PickOptions,
 ) -> PickedFeature | None:
     """The cylinder through the faces of a smooth region; None when they do not lie on one."""
     areas = face_areas(vertices, faces[smooth])
@@ -165,7 +154,7 @@ def _cylinder(
     system = np.column_stack([2.0 * flat, np.ones(len(flat))])
     x, y, rest = np.linalg.lstsq(system, (flat**2).sum(axis=1), rcond=None)[0]
     radius = float(np.sqrt(max(rest + x * x + y * y, 0.0)))
-    if radius <= 0 or np.abs(np.hypot(*(flat - [x, y]).T) - radius).max() > options.round_share * radius:
+    if radius <= 0 or np.abs(np.hypot(*(flat - [x, y]).T) - radius).max() > ROUND_SHARE * radius:
         return None
     along = corners @ axis
     foot = x * axes[0] + y * axes[1] + along.min() * axis
@@ -225,9 +214,15 @@ def _outward(component: Component, rim: RoundEdge) -> Array:
 
 
 def _edge(
-    vertices: Array, faces: NDArray[np.int64], neighbours: NDArray[np.int64], normals: Array, flat: NDArray[np.int64],
-    point: Array, reach_mm: float, sharp_deg: float,
-) -> PickedFeature | None:  # fmt: skip
+    vertices: Array,
+    faces: NDArray[np.int64],
+    neighbours: NDArray[np.int64],
+    normals: Array,
+    flat: NDArray[np.int64],
+    point: Array,
+    reach_mm: float,
+    sharp_deg: float,
+) -> PickedFeature | None:
     """The straight sharp edge of the picked face that is nearest to the point, if it is near enough."""
     beyond = neighbours[flat]
     cosine = np.einsum("fkj,fj->fk", normals[beyond], normals[flat])

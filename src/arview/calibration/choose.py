@@ -14,11 +14,18 @@ import cv2
 import numpy as np
 
 from arview.calibration.projection import PARAMETERS_OF, CalibratedLens, intrinsics_of, pose_of_board
-from arview.calibration.solve import SolveOptions, information, solve
+from arview.calibration.solve import MIN_VIEWS, information, solve
 from arview.calibration.views import BoardView
 from arview.camera import Camera
 from arview.errors import InputError
 from arview.geometry import Array
+
+MAX_ERROR_RATIO = 2.0
+"""Largest expected error (blur, motion) of a view, relative to the median."""
+MIN_SEPARATION = 0.02
+"""Of the diagonal; of views nearer to each other the better one is kept."""
+INITIAL_VIEWS = 25
+"""For the first camera, with which the information of all views is computed."""
 
 
 @dataclass(frozen=True)
@@ -26,16 +33,11 @@ class ChoiceOptions:
     """Number of views, and which views are excluded from the choice."""
 
     max_views: int = 40  # more reduce the noise, but not the errors of the lens model
-    max_error_ratio: float = 2.0  # largest expected error (blur, motion) of a view, relative to the median
-    min_separation: float = 0.02  # of the diagonal; of views nearer to each other the better one is kept
     candidates: int = 160  # views from which the choice is made
-    initial_views: int = 25  # for the first camera, with which the information of all views is computed
 
     def __post_init__(self) -> None:
-        if self.max_views < SolveOptions.min_views or self.candidates < self.max_views or not self.max_error_ratio > 1:
-            raise InputError(
-                f"choice of views: expected at least {SolveOptions.min_views} views and an error ratio above 1"
-            )
+        if self.max_views < MIN_VIEWS or self.candidates < self.max_views:
+            raise InputError(f"choice of views: expected at least {MIN_VIEWS} views, chosen from no fewer candidates")
 
 
 def choose_views(
@@ -61,7 +63,7 @@ def choose_views(
         return list(views), {}
     rejected: dict[str, str] = {}
     expected = np.array([view.sigma_px for view in views])
-    limit = options.max_error_ratio * float(np.median(expected))
+    limit = MAX_ERROR_RATIO * float(np.median(expected))
     outlines = [_outline(view) for view in views]
     kept: list[int] = []
     diagonal = float(np.hypot(width, height))
@@ -69,7 +71,7 @@ def choose_views(
         name = views[i].name
         if expected[i] > limit:
             rejected[name] = "is blurred, or the board moves"
-        elif any(np.max(np.abs(outlines[i] - outlines[k])) < options.min_separation * diagonal for k in kept):
+        elif any(np.max(np.abs(outlines[i] - outlines[k])) < MIN_SEPARATION * diagonal for k in kept):
             rejected[name] = "shows the board where a better view has it"
         elif len(kept) < options.candidates:
             kept.append(int(i))
@@ -90,7 +92,7 @@ def _max_information(
     lens: CalibratedLens,
 ) -> list[int]:
     """Indices of the views that together have the most information, chosen greedily."""
-    camera = solve([views[k] for k in _spread(outlines, options.initial_views)], *size, lens=lens).camera
+    camera = solve([views[k] for k in _spread(outlines, INITIAL_VIEWS)], *size, lens=lens).camera
     shares = np.array([_information(view, camera) for view in views])
     # Prior information: the order of magnitude of the intrinsics.
     side = float(max(size))

@@ -13,9 +13,15 @@ from arview.fiducials.board import Board, cv_board
 from arview.geometry import Array
 
 _DICTIONARIES = (
-    "DICT_4X4_250", "DICT_5X5_250", "DICT_6X6_250", "DICT_7X7_250", "DICT_ARUCO_ORIGINAL", "DICT_APRILTAG_36h11",
-    "DICT_APRILTAG_16h5", "DICT_APRILTAG_25h9",
-)  # fmt: skip
+    "DICT_4X4_250",
+    "DICT_5X5_250",
+    "DICT_6X6_250",
+    "DICT_7X7_250",
+    "DICT_ARUCO_ORIGINAL",
+    "DICT_APRILTAG_36h11",
+    "DICT_APRILTAG_16h5",
+    "DICT_APRILTAG_25h9",
+)
 """Of each family one dictionary that includes the smaller ones, except for boards of more than 250 markers."""
 _MIN_MARKERS = 4
 """Markers of one picture that a conclusion needs."""

@@ -7,7 +7,6 @@ gives the poses of the views, and the one whose corners fit best is adjusted.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -17,40 +16,28 @@ from arview.camera import Camera
 from arview.errors import InputError
 from arview.geometry import Array, exp_so3
 
-
-@dataclass(frozen=True)
-class FisheyeOptions:
-    """Start and end of the adjustment.
-
-    Attributes:
-        start_half_angles_deg: angles off the axis, at the border of the picture's longer side, that are tried.
-        candidates: starts that are adjusted, those that fit best.
-        max_steps: steps of the adjustment.
-        tolerance: relative change of the sum of squares below which it has ended.
-    """
-
-    start_half_angles_deg: tuple[float, ...] = (30.0, 45.0, 60.0, 75.0, 90.0, 105.0)
-    candidates: int = 2
-    max_steps: int = 60
-    tolerance: float = 1e-10
+START_HALF_ANGLES_DEG: tuple[float, ...] = (30.0, 45.0, 60.0, 75.0, 90.0, 105.0)
+"""Angles off the axis, at the border of the picture's longer side, that are tried."""
+CANDIDATES = 2
+"""Starts that are adjusted, those that fit best."""
+MAX_STEPS = 60
+"""Steps of the adjustment."""
+TOLERANCE = 1e-10
+"""Relative change of the sum of squares below which it has ended."""
 
 
-def adjust_fisheye(
-    views: Sequence[BoardView], width: int, height: int, start: Camera | None, options: FisheyeOptions | None = None
-) -> tuple[Camera, Array]:
+def adjust_fisheye(views: Sequence[BoardView], width: int, height: int, start: Camera | None) -> tuple[Camera, Array]:
     """The fisheye camera of the views, and the poses of the board (V,4,4) in it.
 
     Args:
         views: of the board.
         width, height: of the sensor's picture, px.
         start: a camera near the solution, or None.
-        options: see `FisheyeOptions`.
 
     Raises:
         InputError: no start explains the views.
     """
-    options = options or FisheyeOptions()
-    starts = [start] if start is not None else _starts(width, height, options)
+    starts = [start] if start is not None else _starts(width, height)
     found: list[tuple[float, Camera, Array]] = []
     for camera in starts:
         poses = [pose_of_board(view.points_in_board, view.pixels, camera) for view in views]
@@ -58,16 +45,16 @@ def adjust_fisheye(
             stacked = np.array(poses)
             found.append((_cost(views, camera, stacked), camera, stacked))
     found.sort(key=lambda one: one[0])
-    adjusted = [_adjusted(views, camera, poses, options) for _, camera, poses in found[: options.candidates]]
+    adjusted = [_adjusted(views, camera, poses) for _, camera, poses in found[:CANDIDATES]]
     if not adjusted:
         raise InputError("no fisheye camera explains the views of the board")
     _, best, best_poses = min(adjusted, key=lambda one: one[0])
     return best, best_poses
 
 
-def _starts(width: int, height: int, options: FisheyeOptions) -> list[Camera]:
+def _starts(width: int, height: int) -> list[Camera]:
     half = 0.5 * max(width, height)
-    focal_px = [half / np.deg2rad(angle) for angle in options.start_half_angles_deg]
+    focal_px = [half / np.deg2rad(angle) for angle in START_HALF_ANGLES_DEG]
     return [fisheye_camera(width, height, [f, f, 0.5 * (width - 1), 0.5 * (height - 1), 0, 0, 0, 0]) for f in focal_px]
 
 
@@ -79,12 +66,10 @@ def _cost(views: Sequence[BoardView], camera: Camera, poses: Array) -> float:
     return total
 
 
-def _adjusted(
-    views: Sequence[BoardView], camera: Camera, poses: Array, options: FisheyeOptions
-) -> tuple[float, Camera, Array]:
+def _adjusted(views: Sequence[BoardView], camera: Camera, poses: Array) -> tuple[float, Camera, Array]:
     """Sum of squares, camera and poses after the adjustment from a start."""
     cost, damping = _cost(views, camera, poses), 1e-3
-    for _ in range(options.max_steps):
+    for _ in range(MAX_STEPS):
         system = _Normal(views, camera, poses)
         while True:
             try:
@@ -101,7 +86,7 @@ def _adjusted(
                 return cost, camera, poses
         change = (cost - trial_cost) / max(cost, 1e-30)
         camera, poses, cost, damping = trial, moved, trial_cost, max(0.1 * damping, 1e-12)
-        if change < options.tolerance:
+        if change < TOLERANCE:
             break
     return cost, camera, poses
 

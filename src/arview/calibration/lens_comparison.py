@@ -12,21 +12,13 @@ from arview.calibration.solve import adjust
 from arview.calibration.views import BoardView
 from arview.errors import InputError
 
-
-@dataclass(frozen=True)
-class LensComparisonOptions:
-    """When another lens model is recommended.
-
-    Attributes:
-        percentile: of the residuals' lengths that is compared: high, because a wrong model shows at the rim of the
-            picture, and below 100, because single corners are wrong.
-        min_residual_px: residuals below it are those of the corners, whatever the model.
-        min_ratio: residuals of the model in use by those of the other one from which that is recommended.
-    """
-
-    percentile: float = 90.0
-    min_residual_px: float = 0.25
-    min_ratio: float = 1.4
+PERCENTILE = 90.0
+"""Of the residuals' lengths that is compared: high, because a wrong model shows at the rim of the picture, and below
+100, because single corners are wrong."""
+MIN_RESIDUAL_PX = 0.25
+"""Residuals below it are those of the corners, whatever the model."""
+MIN_RATIO = 1.4
+"""Residuals of the model in use by those of the other one from which that is recommended."""
 
 
 @dataclass(frozen=True)
@@ -51,33 +43,31 @@ class LensComparison:
 
 
 def compare_lenses(
-    views: Sequence[BoardView], width: int, height: int, used: CalibratedLens,
-    options: LensComparisonOptions | None = None,
-) -> LensComparison:  # fmt: skip
+    views: Sequence[BoardView],
+    width: int,
+    height: int,
+    used: CalibratedLens,
+) -> LensComparison:
     """Compare the lens model in use with the other one, on all views and without leaving out corners.
 
     Args:
         views: of the board, before any was rejected.
         width, height: of the sensor's picture, px.
         used: model that is calibrated.
-        options: see `LensComparisonOptions`.
     """
-    options = options or LensComparisonOptions()
     other = CalibratedLens.BROWN if used is CalibratedLens.FISHEYE else CalibratedLens.FISHEYE
-    used_px = _residual_px(views, width, height, used, options)
+    used_px = _residual_px(views, width, height, used)
     # The other model is fitted only where the one in use leaves something to explain.
     other_px = used_px
-    if used_px > options.min_residual_px:
-        other_px = _residual_px(views, width, height, other, options)
-    return LensComparison(used, used_px, other, other_px, used_px > options.min_ratio * other_px)
+    if used_px > MIN_RESIDUAL_PX:
+        other_px = _residual_px(views, width, height, other)
+    return LensComparison(used, used_px, other, other_px, used_px > MIN_RATIO * other_px)
 
 
-def _residual_px(
-    views: Sequence[BoardView], width: int, height: int, lens: CalibratedLens, options: LensComparisonOptions
-) -> float:
+def _residual_px(views: Sequence[BoardView], width: int, height: int, lens: CalibratedLens) -> float:
     try:
         solution = adjust(views, width, height, None, lens)
     except InputError:
         return float("inf")
     lengths = np.linalg.norm(np.concatenate(solution.residuals), axis=1)
-    return float(np.percentile(lengths, options.percentile))
+    return float(np.percentile(lengths, PERCENTILE))

@@ -30,8 +30,17 @@ def draw(calibration: Calibration, kind: str = "png") -> bytes:
     scale = _ARROW * max(camera.width, camera.height) / longest
     height = 4.6 * min(1.6, max(0.5, camera.height / camera.width)) + 0.7
     with figure(height, 10.0, has_grid=False, ncols=2) as (made, (left, right)):
-        arrows = left.quiver(*pixels.T, *(residuals * scale).T, length, angles="xy", scale_units="xy", scale=1,
-                             cmap="viridis", width=0.0022, clim=(0, longest))  # fmt: skip
+        arrows = left.quiver(
+            *pixels.T,
+            *(residuals * scale).T,
+            length,
+            angles="xy",
+            scale_units="xy",
+            scale=1,
+            cmap="viridis",
+            width=0.0022,
+            clim=(0, longest),
+        )
         made.colorbar(arrows, ax=left, orientation="horizontal", aspect=40, label="residual, px")
         covered = f"{len(pixels)} corners, {len(solution.views)} views, {100 * verdict.coverage:.0f} % of the picture"
         left.set_title(f"{covered}; residuals {solution.rms_px:.2f} px", loc="left", fontsize=9.5, color=INK)

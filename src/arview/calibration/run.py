@@ -13,8 +13,8 @@ import numpy as np
 from arview.calibration.choose import ChoiceOptions, choose_views
 from arview.calibration.lens_comparison import LensComparison, compare_lenses
 from arview.calibration.projection import CalibratedLens, lens_of
-from arview.calibration.solve import K, Solution, SolveOptions, solve
-from arview.calibration.verdict import CalibrationVerdict, VerdictOptions, assess
+from arview.calibration.solve import MIN_VIEWS, K, Solution, solve
+from arview.calibration.verdict import CalibrationVerdict, assess
 from arview.calibration.views import BoardSightings, BoardView, find_views
 from arview.camera import Camera
 from arview.camera.profiles import lens_record
@@ -59,8 +59,6 @@ def calibrate(
     sources: Sequence[str | Path],
     board: Board,
     choice: ChoiceOptions | None = None,
-    solving: SolveOptions | None = None,
-    limits: VerdictOptions | None = None,
     progress: StepProgress | None = None,
     lens: CalibratedLens = CalibratedLens.BROWN,
 ) -> Calibration:
@@ -70,8 +68,6 @@ def calibrate(
         sources: photo files, folders, globs; or one video.
         board: the board in them.
         choice: how views are chosen if there are many.
-        solving: how outliers are rejected.
-        limits: of the grades.
         progress: called with pictures done and in all.
         lens: model of the lens.
 
@@ -79,24 +75,23 @@ def calibrate(
         InputError: nothing can be read, there is no board, there are too few views, or no camera explains them.
     """
     sightings = find_views(sources, board, progress)
-    min_views = (solving or SolveOptions()).min_views
-    if len(sightings.views) < min_views:
+    if len(sightings.views) < MIN_VIEWS:
         why = "; ".join(f"{name} {reason}" for name, reason in list(sightings.rejected.items())[:3])
         raise InputError(
             f"{sightings.label}: the board is seen in {len(sightings.views)} of {sightings.searched} pictures, at"
-            f" least {min_views} are needed, 20 are good" + (f" ({why})" if why else "")
+            f" least {MIN_VIEWS} are needed, 20 are good" + (f" ({why})" if why else "")
         )
     size = (sightings.width, sightings.height)
     views: Sequence[BoardView] = sightings.views
     try:
         views, left_out = choose_views(views, *size, choice, lens)
-        solution = solve(views, *size, solving, lens)
+        solution = solve(views, *size, lens)
     except InputError as error:
         advice = compare_lenses(views[: ChoiceOptions.max_views], *size, lens).advice
         raise InputError(f"{sightings.label}: {error}{f'; {advice}' if advice else ''}") from error
     rejected = sightings.rejected | left_out | solution.rejected
     lenses = compare_lenses(views, *size, lens)
-    verdict = assess(solution, limits).with_lenses(lenses.advice)
+    verdict = assess(solution).with_lenses(lenses.advice)
     return Calibration(board, sightings, solution, verdict, rejected, lenses)
 
 

@@ -19,7 +19,7 @@ from arview.calibration.fisheye import adjust_fisheye
 from arview.calibration.projection import PARAMETERS_OF, CalibratedLens, lens_of, project
 from arview.calibration.views import MIN_CORNERS, BoardView
 from arview.camera import Camera
-from arview.camera.undistort import UndistortOptions
+from arview.camera.undistort import MAX_HALF_ANGLE_DEG
 from arview.errors import InputError
 from arview.geometry import Array, rigid
 
@@ -27,19 +27,16 @@ K = 2.0
 """Coverage factor of every U in this room: 95 % of a normal distribution."""
 
 
-@dataclass(frozen=True)
-class SolveOptions:
-    """Rejection of outliers."""
-
-    min_views: int = 5  # with fewer, poses and nine intrinsics are hardly checked
-    view_outlier: float = 2.5  # times the median view's rms; a view above is blurred or bent
-    view_floor_px: float = 0.15  # views that fit this well are kept, however well the others fit
-    corner_outlier: float = 4.5  # robust standard deviations; 1 in 25,000 normal errors is larger
-    rounds: int = 12  # of solving and rejecting; wrong corners are removed a few at a time
-
-    def __post_init__(self) -> None:
-        if self.min_views < 3 or not (self.view_outlier > 1 and self.corner_outlier > 2 and self.rounds > 0):
-            raise InputError("calibration: expected at least 3 views, and outliers beyond 1 (views) and 2 (corners)")
+MIN_VIEWS = 5
+"""With fewer, poses and nine intrinsics are hardly checked."""
+VIEW_OUTLIER = 2.5
+"""Times the median view's rms; a view above is blurred or bent."""
+VIEW_FLOOR_PX = 0.15
+"""Views that fit this well are kept, however well the others fit."""
+CORNER_OUTLIER = 4.5
+"""Robust standard deviations; 1 in 25,000 normal errors is larger."""
+ROUNDS = 12
+"""Of solving and rejecting; wrong corners are removed a few at a time."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +78,6 @@ def solve(
     views: Sequence[BoardView],
     width: int,
     height: int,
-    options: SolveOptions | None = None,
     lens: CalibratedLens = CalibratedLens.BROWN,
 ) -> Solution:
     """Calibrate the camera that took the views.
@@ -89,27 +85,25 @@ def solve(
     Args:
         views: of the board.
         width, height: of the sensor's picture, px.
-        options: see `SolveOptions`.
         lens: model of the lens.
 
     Raises:
         InputError: too few views fit together, or the adjustment fails; the message says what to do.
     """
-    options = options or SolveOptions()
     kept, rejected = list(views), dict[str, str]()
     before = sum(len(view.ids) for view in kept)
     solution: Solution | None = None
-    for _ in range(options.rounds):
-        if len(kept) < options.min_views:
+    for _ in range(ROUNDS):
+        if len(kept) < MIN_VIEWS:
             raise InputError(
-                f"only {len(kept)} of {len(views)} views of the board fit together; at least {options.min_views} are"
+                f"only {len(kept)} of {len(views)} views of the board fit together; at least {MIN_VIEWS} are"
                 " needed, 20 are good: hold the board flat and still, in focus, and take it from many sides"
             )
         solution = adjust(kept, width, height, None if solution is None else solution.camera, lens)
-        trimmed = [_trimmed(view, r, options) for view, r in zip(kept, solution.residuals, strict=True)]
+        trimmed = [_trimmed(view, r) for view, r in zip(kept, solution.residuals, strict=True)]
         # A wrong corner distorts its view's pose, so views are only rejected once no corner is.
         unchanged = {view.name for view, less in zip(kept, trimmed, strict=True) if len(view.ids) == len(less.ids)}
-        bad = _bad_views(solution, unchanged, options)
+        bad = _bad_views(solution, unchanged)
         rejected |= bad
         if not bad and len(unchanged) == len(kept):
             break
@@ -158,7 +152,7 @@ def seen_by_lens(camera: Camera, rays: Array) -> NDArray[np.bool_]:
     """(N,) whether rays (N,3) are judged: all of a Brown lens, of a fisheye those that `Undistorter` shows."""
     if lens_of(camera) is CalibratedLens.BROWN:
         return np.ones(len(rays), dtype=bool)
-    slope = float(np.tan(np.deg2rad(UndistortOptions.max_half_angle_deg)))
+    slope = float(np.tan(np.deg2rad(MAX_HALF_ANGLE_DEG)))
     with np.errstate(invalid="ignore"):
         return np.asarray(np.hypot(rays[:, 0], rays[:, 1]) <= slope)
 
@@ -206,7 +200,16 @@ def adjust(views: Sequence[BoardView], width: int, height: int, start: Camera | 
     ]
     covariance = _covariance(views, found, poses, residuals)
     rms = float(np.sqrt(np.mean(np.concatenate(residuals) ** 2)))
-    return Solution(found, covariance, tuple(views), poses, tuple(residuals), rms, {}, 0)
+    return Solution(
+        found,
+        covariance,
+        tuple(views),
+        cams_from_board=poses,
+        residuals=tuple(residuals),
+        rms_px=rms,
+        rejected={},
+        corners_left_out=0,
+    )
 
 
 def _adjust_brown(views: Sequence[BoardView], width: int, height: int, start: Camera | None) -> tuple[Camera, Array]:
@@ -226,10 +229,12 @@ def _adjust_brown(views: Sequence[BoardView], width: int, height: int, start: Ca
         found = Camera(width, height, fx, fy, cx, cy, np.ravel(d)[:5])
     except (cv2.error, ValueError) as error:
         raise InputError("OpenCV finds no camera") from error
-    poses = np.array([
-        rigid(cv2.Rodrigues(np.asarray(turn))[0], np.asarray(shift).ravel())
-        for turn, shift in zip(turns, shifts, strict=True)
-    ])  # fmt: skip
+    poses = np.array(
+        [
+            rigid(cv2.Rodrigues(np.asarray(turn))[0], np.asarray(shift).ravel())
+            for turn, shift in zip(turns, shifts, strict=True)
+        ]
+    )
     return found, poses
 
 
@@ -257,13 +262,13 @@ def _covariance(views: Sequence[BoardView], camera: Camera, poses: Array, residu
     return np.asarray(own * np.outer(grow, grow))
 
 
-def _bad_views(solution: Solution, unchanged: set[str], options: SolveOptions) -> dict[str, str]:
+def _bad_views(solution: Solution, unchanged: set[str]) -> dict[str, str]:
     """Views that fit much worse than the others, at most a third of them at once, the worst first."""
     rms = np.array([np.sqrt(np.mean(residual**2)) for residual in solution.residuals])
     # A robust size, because single wrong corners are rejected by themselves.
     size = np.array([np.median(np.abs(residual)) / 0.6745 for residual in solution.residuals])
     usual = float(np.median(size))
-    limit = max(options.view_outlier * usual, options.view_floor_px)
+    limit = max(VIEW_OUTLIER * usual, VIEW_FLOOR_PX)
     bad = [int(i) for i in np.argsort(-size) if size[i] > limit and solution.views[i].name in unchanged]
     bad = bad[: max(1, len(rms) // 3)]
     return {
@@ -271,11 +276,11 @@ def _bad_views(solution: Solution, unchanged: set[str], options: SolveOptions) -
     }
 
 
-def _trimmed(view: BoardView, residual: Array, options: SolveOptions) -> BoardView:
+def _trimmed(view: BoardView, residual: Array) -> BoardView:
     """The view without corners whose residuals are outliers."""
     length = np.linalg.norm(residual, axis=1)
     # The median length of a two-dimensional normal error is 1.1774 σ.
-    keep = length < options.corner_outlier * max(float(np.median(length)) / 1.1774, 0.02)
+    keep = length < CORNER_OUTLIER * max(float(np.median(length)) / 1.1774, 0.02)
     if keep.all():
         return view
     return replace(view, ids=view.ids[keep], points_in_board=view.points_in_board[keep], pixels=view.pixels[keep])

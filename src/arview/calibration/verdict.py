@@ -19,20 +19,26 @@ class Grade(StrEnum):
     NOT_ENOUGH = "not enough"
 
 
-@dataclass(frozen=True)
-class VerdictOptions:
-    """Limits of the grades; lengths in px as shares of the picture's diagonal."""
-
-    good_focal: float = 0.002  # relative U of the focal length: 0.2 % of the distance, 1 mm at arm's length
-    usable_focal: float = 0.01  # a guess from EXIF data is as good as more than this
-    good_pixel: float = 5e-4  # U of where a ray is seen, at the worst of 63 places: 1 px at 1080p
-    usable_pixel: float = 3e-3  # limit of usable for the same
-    usable_rms: float = 1e-3  # residuals; above, the board is not flat, or is another one
-    good_coverage: float = 0.7  # share of the picture's cells with a corner of the board
-    usable_coverage: float = 0.4  # limit of usable for the same
-    tilted_deg: float = 20.0  # views tilted by more than this determine the focal length
-    min_tilted: int = 4  # number of such views, to at least two sides
-    good_range: float = 1.3  # distance of the farthest over the nearest board
+GOOD_FOCAL = 0.002
+"""Relative U of the focal length: 0.2 % of the distance, 1 mm at arm's length."""
+USABLE_FOCAL = 0.01
+"""A guess from EXIF data is as good as more than this."""
+GOOD_PIXEL = 5e-4
+"""U of where a ray is seen, at the worst of 63 places: 1 px at 1080p."""
+USABLE_PIXEL = 3e-3
+"""Limit of usable for the same."""
+USABLE_RMS = 1e-3
+"""Residuals; above, the board is not flat, or is another one."""
+GOOD_COVERAGE = 0.7
+"""Share of the picture's cells with a corner of the board."""
+USABLE_COVERAGE = 0.4
+"""Limit of usable for the same."""
+TILTED_DEG = 20.0
+"""Views tilted by more than this determine the focal length."""
+MIN_TILTED = 4
+"""Number of such views, to at least two sides."""
+GOOD_RANGE = 1.3
+"""Distance of the farthest over the nearest board."""
 
 
 @dataclass(frozen=True)
@@ -72,9 +78,8 @@ class CalibrationVerdict:
         return replace(self, grade=grade, reasons=reasons, advice=(advice, *self.advice))
 
 
-def assess(solution: Solution, options: VerdictOptions | None = None) -> CalibrationVerdict:
+def assess(solution: Solution) -> CalibrationVerdict:
     """Compare a calibration with the limits, and say what to do if it is not good."""
-    options = options or VerdictOptions()
     camera = solution.camera
     diagonal = float(np.hypot(camera.width, camera.height))
     std = dict(zip(solution.parameters, solution.std, strict=True))
@@ -83,38 +88,40 @@ def assess(solution: Solution, options: VerdictOptions | None = None) -> Calibra
     pixel_u = pixel_uncertainty(solution, picture_grid(camera.width, camera.height))
     cells = _cells(solution)
     coverage = float(np.mean(cells[~np.isnan(cells)] > 0))
-    tilts, sides, distances = _attitudes(solution, options.tilted_deg)
+    tilts, sides, distances = _attitudes(solution, TILTED_DEG)
     ratio = float(distances.max() / distances.min())
     worst = float(np.nanmax(pixel_u))
 
     grades = [
-        _grade(focal_u, options.good_focal, options.usable_focal),
-        _grade(worst / diagonal, options.good_pixel, options.usable_pixel),
-        _grade(solution.rms_px / diagonal, 0.5 * options.usable_rms, options.usable_rms),
-        _grade(-coverage, -options.good_coverage, -options.usable_coverage),
+        _grade(focal_u, GOOD_FOCAL, USABLE_FOCAL),
+        _grade(worst / diagonal, GOOD_PIXEL, USABLE_PIXEL),
+        _grade(solution.rms_px / diagonal, 0.5 * USABLE_RMS, USABLE_RMS),
+        _grade(-coverage, -GOOD_COVERAGE, -USABLE_COVERAGE),
     ]
     reasons = [
-        f"the focal length is known to ± {100 * focal_u:.2f} % only" if np.isfinite(focal_u)
+        f"the focal length is known to ± {100 * focal_u:.2f} % only"
+        if np.isfinite(focal_u)
         else "the views do not determine the focal length",
-        f"a ray at the worst place of the picture is known to ± {worst:.2f} px only" if np.isfinite(worst)
+        f"a ray at the worst place of the picture is known to ± {worst:.2f} px only"
+        if np.isfinite(worst)
         else "the views do not determine where rays are seen",
         f"the corners scatter by {solution.rms_px:.2f} px",
         f"corners of the board were seen in only {100 * coverage:.0f} % of the picture",
-    ]  # fmt: skip
+    ]
     why = [reason for reason, grade in zip(reasons, grades, strict=True) if grade is not Grade.GOOD]
     order = list(Grade)
     grade = max(grades, key=order.index)
     advice: list[str] = []
     if grade is not Grade.GOOD:
-        tilted = int(np.sum(tilts >= options.tilted_deg))
+        tilted = int(np.sum(tilts >= TILTED_DEG))
         focal_is_poor = grades[0] is not Grade.GOOD
-        if focal_is_poor and (tilted < options.min_tilted or sides < 2):
+        if focal_is_poor and (tilted < MIN_TILTED or sides < 2):
             advice.append("tilt the board more, by 30° to 45°, to the left, the right, upwards and downwards")
         if grades[3] is not Grade.GOOD or (grades[1] is not Grade.GOOD and not focal_is_poor):
             missing = _empty_corners(cells)
             where = f": none was seen in the {', '.join(missing)}" if missing else ""
             advice.append(f"bring the board to the corners and edges of the picture{where}")
-        if focal_is_poor and ratio < options.good_range:
+        if focal_is_poor and ratio < GOOD_RANGE:
             advice.append("take it from nearer and from farther: once filling the picture, once half of it")
         if len(solution.views) < 15:
             advice.append(f"take more views: {len(solution.views)} were used, 20 to 40 are good")
@@ -125,9 +132,17 @@ def assess(solution: Solution, options: VerdictOptions | None = None) -> Calibra
         if not advice:
             advice.append("take more views, tilted to all sides, with the board filling the picture")
     return CalibrationVerdict(
-        grade, focal_u, centre_u, (float(np.nanmedian(pixel_u)), worst), coverage, cells,
-        (float(tilts.min()), float(np.median(tilts)), float(tilts.max())), ratio, tuple(why), tuple(advice),
-    )  # fmt: skip
+        grade,
+        focal_u,
+        centre_u,
+        pixel_u_px=(float(np.nanmedian(pixel_u)), worst),
+        coverage=coverage,
+        cells=cells,
+        tilts_deg=(float(tilts.min()), float(np.median(tilts)), float(tilts.max())),
+        distance_ratio=ratio,
+        reasons=tuple(why),
+        advice=tuple(advice),
+    )
 
 
 def _grade(value: float, good: float, usable: float) -> Grade:
@@ -154,10 +169,12 @@ def _cells(solution: Solution) -> Array:
 
 def _attitudes(solution: Solution, tilted_deg: float) -> tuple[Array, int, Array]:
     """Tilt of each view in degrees, number of sides (of four) to which tilted views lean, and distances in mm."""
-    middles = np.array([
-        pose[:3, :3] @ view.points_in_board.mean(axis=0) + pose[:3, 3]
-        for view, pose in zip(solution.views, solution.cams_from_board, strict=True)
-    ])  # fmt: skip
+    middles = np.array(
+        [
+            pose[:3, :3] @ view.points_in_board.mean(axis=0) + pose[:3, 3]
+            for view, pose in zip(solution.views, solution.cams_from_board, strict=True)
+        ]
+    )
     normals = solution.cams_from_board[:, :3, 2]
     # A board parallel to the picture plane does not determine the focal length, wherever it is seen.
     tilts = np.degrees(np.arccos(np.clip(np.abs(normals[:, 2]), 0.0, 1.0)))
@@ -168,6 +185,9 @@ def _attitudes(solution: Solution, tilted_deg: float) -> tuple[Array, int, Array
 def _empty_corners(cells: Array) -> list[str]:
     """Names of the picture's corners without a corner of the board."""
     names = {
-        "upper left": (0, 0), "upper right": (0, -1), "lower left": (-1, 0), "lower right": (-1, -1),
-    }  # fmt: skip
+        "upper left": (0, 0),
+        "upper right": (0, -1),
+        "lower left": (-1, 0),
+        "lower right": (-1, -1),
+    }
     return [name for name, place in names.items() if cells[place] == 0]

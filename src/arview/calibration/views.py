@@ -203,7 +203,17 @@ def _views_of_photos(
             f"{len(others)} of {len(paths)} photos are of another camera, zoom or size and are left out: "
             f"{', '.join(list(others)[:4])}; calibrate these separately"
         )
-    return BoardSightings(label, width, height, tuple(views), rejected, len(paths), first, turns, tuple(warnings))
+    return BoardSightings(
+        label,
+        width,
+        height,
+        views=tuple(views),
+        rejected=rejected,
+        searched=len(paths),
+        exif=first,
+        quarter_turns_clockwise=turns,
+        warnings=tuple(warnings),
+    )
 
 
 def _exif_of_all(paths: Sequence[Path], names: Sequence[str]) -> tuple[dict[str, PhotoExif], dict[str, str]]:

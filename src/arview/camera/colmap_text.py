@@ -32,10 +32,19 @@ _LENS_MODELS: dict[str, tuple[tuple[int, ...], tuple[int, ...], LensModel]] = {
     "DIVISION": ((0, 1, 2, 3), (4,), LensModel.DIVISION),
 }
 _BINARY_MODELS = {
-    0: ("SIMPLE_PINHOLE", 3), 1: ("PINHOLE", 4), 2: ("SIMPLE_RADIAL", 4), 3: ("RADIAL", 5), 4: ("OPENCV", 8),
-    5: ("OPENCV_FISHEYE", 8), 6: ("FULL_OPENCV", 12), 7: ("FOV", 5), 8: ("SIMPLE_RADIAL_FISHEYE", 4),
-    9: ("RADIAL_FISHEYE", 5), 10: ("THIN_PRISM_FISHEYE", 12), 11: ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
-}  # fmt: skip
+    0: ("SIMPLE_PINHOLE", 3),
+    1: ("PINHOLE", 4),
+    2: ("SIMPLE_RADIAL", 4),
+    3: ("RADIAL", 5),
+    4: ("OPENCV", 8),
+    5: ("OPENCV_FISHEYE", 8),
+    6: ("FULL_OPENCV", 12),
+    7: ("FOV", 5),
+    8: ("SIMPLE_RADIAL_FISHEYE", 4),
+    9: ("RADIAL_FISHEYE", 5),
+    10: ("THIN_PRISM_FISHEYE", 12),
+    11: ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
+}
 """Names and numbers of parameters of the models in a binary file."""
 _MIN_CAMERA_BYTES = 48
 _COLMAP_LINE = re.compile(r"^\d+\s+[A-Z][A-Z_0-9]+\s+\d+\s+\d+\s")
@@ -113,4 +122,14 @@ def _entry(line: str) -> CameraEntry:
         raise InputError(f"camera {label}: {model} needs {expected} parameters, the file gives {len(params)}")
     fx, fy, cx, cy = (params[place] for place in places)
     dist, lens = simplest(LensDistortion(kind, tuple(params[place] for place in lens_places)))
-    return CameraEntry(fx, fy, cx - COLMAP_HALF_PX, cy - COLMAP_HALF_PX, dist, lens, width, height, label=label)
+    return CameraEntry(
+        fx,
+        fy,
+        cx - COLMAP_HALF_PX,
+        cy=cy - COLMAP_HALF_PX,
+        dist=dist,
+        lens=lens,
+        width=width,
+        height=height,
+        label=label,
+    )

@@ -29,7 +29,7 @@ from arview.camera.keys import (
     is_of_a_camera,
     is_suspicious,
     plain_name,
-)  # fmt: skip
+)
 from arview.camera.model import COLMAP_HALF_PX
 from arview.camera.terms import lens_from_terms
 from arview.camera.tree import numbers_of
@@ -263,8 +263,18 @@ def _read(node: Mapping[str, Any], label: str) -> CameraEntry:
     dist, lens = lens_from_terms(models, listed[0][1] if listed else None, named)
     fx, fy, cx, cy = _pinhole(matrices, numbers, width, height)
     return CameraEntry(
-        fx, fy, cx - half_px, cy - half_px, dist, lens, width, height, _roi(node), _binning(node), label=label
-    )  # fmt: skip
+        fx,
+        fy,
+        cx - half_px,
+        cy=cy - half_px,
+        dist=dist,
+        lens=lens,
+        width=width,
+        height=height,
+        roi=_roi(node),
+        binning=_binning(node),
+        label=label,
+    )
 
 
 def _is_projection(value: Any) -> bool:
@@ -280,9 +290,11 @@ def _one(value: Any, key: str) -> float:
 
 
 def _pinhole(
-    matrices: Sequence[tuple[str, list[float]]], numbers: Mapping[str, tuple[str, float]], width: int | None,
+    matrices: Sequence[tuple[str, list[float]]],
+    numbers: Mapping[str, tuple[str, float]],
+    width: int | None,
     height: int | None,
-) -> tuple[float, float, float, float]:  # fmt: skip
+) -> tuple[float, float, float, float]:
     """fx, fy, cx, cy px of a matrix, of a list of four, or of single numbers."""
     found = [(key, _of_matrix(key, matrix)) for key, matrix in matrices]
     single = {name: numbers[name][1] for name in ("fx", "fy", "cx", "cy") if name in numbers}

@@ -6,41 +6,108 @@ import re
 from typing import Any
 
 MATRIX = frozenset({"cameramatrix", "intrinsicmatrix", "camk", "k", "mtx"})
-DIST = frozenset({
-    "distortioncoefficients", "distcoeffs", "distcoeff", "distcoefs", "distortion", "dist", "d", "distortioncoeffs",
-    "distortioncoeff", "distortionparams", "distortionparameters", "coeffs",
-})  # fmt: skip
+DIST = frozenset(
+    {
+        "distortioncoefficients",
+        "distcoeffs",
+        "distcoeff",
+        "distcoefs",
+        "distortion",
+        "dist",
+        "d",
+        "distortioncoeffs",
+        "distortioncoeff",
+        "distortionparams",
+        "distortionparameters",
+        "coeffs",
+    }
+)
 MODEL = frozenset({"distortionmodel", "distortiontype", "cameramodel", "cameratype", "lensmodel", "model"})
 FISHEYE_SWITCHES = frozenset({"fisheyemodel", "isfisheye", "fisheye"})
 SIZE = frozenset({"imagesize", "imgsize", "size", "resolution"})
-CONTAINERS = frozenset({
-    "intrinsics", "intrinsic", "intrinsicparameters", "distortion", "distortioncoefficients", "dist", "imagesize",
-    "resolution", "size",
-})  # fmt: skip
+CONTAINERS = frozenset(
+    {
+        "intrinsics",
+        "intrinsic",
+        "intrinsicparameters",
+        "distortion",
+        "distortioncoefficients",
+        "dist",
+        "imagesize",
+        "resolution",
+        "size",
+    }
+)
 """Maps whose content belongs to the camera that holds them."""
 NUMBERS = {
-    "fx": "fx", "fy": "fy", "cx": "cx", "cy": "cy", "ppx": "cx", "ppy": "cy", "flx": "fx", "fly": "fy",
-    "cameraanglex": "fov_x", "width": "width", "height": "height", "imagewidth": "width", "imageheight": "height",
-    "w": "width", "h": "height",
-}  # fmt: skip
+    "fx": "fx",
+    "fy": "fy",
+    "cx": "cx",
+    "cy": "cy",
+    "ppx": "cx",
+    "ppy": "cy",
+    "flx": "fx",
+    "fly": "fy",
+    "cameraanglex": "fov_x",
+    "width": "width",
+    "height": "height",
+    "imagewidth": "width",
+    "imageheight": "height",
+    "w": "width",
+    "h": "height",
+}
 NERF_SIGNS = frozenset({"flx", "fly", "cameraanglex"})
 """Names that only nerfstudio and instant-ngp use, whose first pixel has its corner at (0, 0)."""
 TERMS = {
     name: name
     for name in ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "s1", "s2", "s3", "s4", "tauy", "taux", "omega", "xi")
 }
-IGNORED = frozenset({
-    # Uncertainties, other pictures and places of the camera.
-    "uncertainty", "std", "stddeviation", "covariance", "rectificationmatrix", "rectification", "projectionmatrix",
-    "r", "p",
-    "rotationmatrix", "camrw2c", "camtw2c", "tcamimu", "tcncnm1", "timeshiftcamimu", "camoverlaps", "transformmatrix",
-    "header", "extrinsics", "perviewreprojectionerrors", "extrinsicparameters", "imagepoints", "gridpoints",
-    # Scales of depth and of the scene.
-    "depthscale", "depthunitscalefactor", "integerdepthscale", "aabbscale", "appliedscale", "scenescale",
-    # Of the calibration, not of the camera.
-    "fixaspectratio", "aspectratio", "flags", "boardwidth", "boardheight", "squaresize", "markersize",
-    "cameraangley", "orientationoverride", "lensposition",
-})  # fmt: skip
+IGNORED = frozenset(
+    {
+        # Uncertainties, other pictures and places of the camera.
+        "uncertainty",
+        "std",
+        "stddeviation",
+        "covariance",
+        "rectificationmatrix",
+        "rectification",
+        "projectionmatrix",
+        "r",
+        "p",
+        "rotationmatrix",
+        "camrw2c",
+        "camtw2c",
+        "tcamimu",
+        "tcncnm1",
+        "timeshiftcamimu",
+        "camoverlaps",
+        "transformmatrix",
+        "header",
+        "extrinsics",
+        "perviewreprojectionerrors",
+        "extrinsicparameters",
+        "imagepoints",
+        "gridpoints",
+        # Scales of depth and of the scene.
+        "depthscale",
+        "depthunitscalefactor",
+        "integerdepthscale",
+        "aabbscale",
+        "appliedscale",
+        "scenescale",
+        # Of the calibration, not of the camera.
+        "fixaspectratio",
+        "aspectratio",
+        "flags",
+        "boardwidth",
+        "boardheight",
+        "squaresize",
+        "markersize",
+        "cameraangley",
+        "orientationoverride",
+        "lensposition",
+    }
+)
 _SUSPICIOUS = re.compile(
     r"distort|^dist$|coef|^lens|fisheye|crop|^roi|region|offset|binn|^bin$|scal|skip|zoom|skew|^tau|^xi$|omega|^alpha$"
     r"|decimat|(?:sub|down|up)sampl|resiz|mirror|flip|radial|tangential|prism|rectif|^[kpsdb]\d+$|^kc$|brown|equidist|kannala|^aoi|^pad|^trim|shift"

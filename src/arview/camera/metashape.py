@@ -91,9 +91,16 @@ def _entry(calibration: ElementTree.Element, sensor: ElementTree.Element | None,
     width, height = int(numbers["width"]), int(numbers["height"])
     terms = tuple(numbers.get(key, 0.0) for key in ("k1", "k2", "p2", "p1", "k3"))
     return CameraEntry(
-        focal + numbers.get("b1", 0.0), focal, 0.5 * width + numbers.get("cx", 0.0) - COLMAP_HALF_PX,
-        0.5 * height + numbers.get("cy", 0.0) - COLMAP_HALF_PX, terms, None, width, height, label=label,
-    )  # fmt: skip
+        focal + numbers.get("b1", 0.0),
+        focal,
+        0.5 * width + numbers.get("cx", 0.0) - COLMAP_HALF_PX,
+        cy=0.5 * height + numbers.get("cy", 0.0) - COLMAP_HALF_PX,
+        dist=terms,
+        lens=None,
+        width=width,
+        height=height,
+        label=label,
+    )
 
 
 def _number(element: ElementTree.Element, of_label: str) -> float:

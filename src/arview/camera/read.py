@@ -163,7 +163,9 @@ def _fit_to_frames(entry: CameraEntry, path: Path, width: int | None, height: in
 def _checked_camera(entry: CameraEntry, width: int, height: int, path: Path) -> Camera:
     """The camera of an entry; raises InputError, with the file name, for values that no camera has."""
     try:
-        camera = Camera(width, height, entry.fx, entry.fy, entry.cx, entry.cy, np.array(entry.dist), entry.lens)
+        camera = Camera(
+            width, height, entry.fx, fy=entry.fy, cx=entry.cx, cy=entry.cy, dist=np.array(entry.dist), lens=entry.lens
+        )
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     w, h = width, height

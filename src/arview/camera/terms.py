@@ -34,17 +34,37 @@ class _Kind(StrEnum):
 _KINDS = {
     _Kind.ANY: ("", "pinhole", "simplepinhole", "perspective", "opencv", "fullopencv", "standard"),
     _Kind.NONE: ("none", "nodistortion"),
-    _Kind.BROWN: ("plumbbob", "radtan", "radialtangential", "brownconrady", "brown", "simpleradial", "radial",
-                  "pinholeradtan"),
+    _Kind.BROWN: (
+        "plumbbob",
+        "radtan",
+        "radialtangential",
+        "brownconrady",
+        "brown",
+        "simpleradial",
+        "radial",
+        "pinholeradtan",
+    ),
     _Kind.OPENCV: ("rationalpolynomial", "rational", "thinprism"),
     _Kind.SKEWED_BROWN: ("modifiedbrownconrady",),
     _Kind.INVERSE_BROWN: ("inversebrownconrady", "inversebrown"),
     _Kind.THIN_PRISM_FISHEYE: ("thinprismfisheye",),
-    _Kind.FISHEYE: ("equidistant", "equi", "fisheye", "opencvfisheye", "kannalabrandt", "kannalabrandt4",
-                    "kannalabrandt8", "kb4", "simplefisheye", "simpleradialfisheye", "radialfisheye", "pinholeequi"),
+    _Kind.FISHEYE: (
+        "equidistant",
+        "equi",
+        "fisheye",
+        "opencvfisheye",
+        "kannalabrandt",
+        "kannalabrandt4",
+        "kannalabrandt8",
+        "kb4",
+        "simplefisheye",
+        "simpleradialfisheye",
+        "radialfisheye",
+        "pinholeequi",
+    ),
     _Kind.FOV: ("fov", "ftheta", "pinholefov"),
     _Kind.DIVISION: ("division", "simpledivision"),
-}  # fmt: skip
+}
 _KIND_OF_NAME = {name: kind for kind, names in _KINDS.items() for name in names}
 _LENS_OF_KIND = {
     _Kind.FISHEYE: LensModel.FISHEYE,

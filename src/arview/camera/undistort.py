@@ -17,52 +17,55 @@ from arview.camera.model import Camera
 from arview.errors import InputError
 from arview.geometry import Array
 
+MAX_FIT_ERROR_PX = 0.03
+"""Largest deviation of Brown's terms from a lens that they replace, px of the picture."""
+GRID = 40
+"""Points across and down of the picture at which the terms are fitted; they are checked at twice as many."""
+MAX_HALF_ANGLE_DEG = 75.0
+"""The pinhole camera sees at most this far to each side."""
+
 
 @dataclass(frozen=True)
 class UndistortOptions:
     """How a lens is replaced.
 
     Attributes:
-        max_fit_error_px: largest deviation of Brown's terms from a lens that they replace, px of the picture.
-        grid: points across and down of the picture at which the terms are fitted; they are checked at twice as many.
-        max_half_angle_deg: the pinhole camera sees at most this far to each side.
         max_growth: sides of the pinhole's picture by those of the original; a lens that needs more loses resolution
             and, from ``min_scale`` of it on, the rim of the picture.
         min_scale: smallest resolution of the pinhole's picture by that at the centre of the original.
     """
 
-    max_fit_error_px: float = 0.03
-    grid: int = 40
-    max_half_angle_deg: float = 75.0
     max_growth: float = 2.5
     min_scale: float = 0.6
 
 
-def brown_camera(camera: Camera, options: UndistortOptions | None = None) -> Camera | None:
+def brown_camera(camera: Camera) -> Camera | None:
     """The camera with Brown's five terms for its lens; None where these are not exact over the whole picture.
 
     The terms are the linear least-squares fit, with the same calibration matrix, to rays of a grid of pixels.
     """
     if camera.lens is None:
         return camera
-    o = options or UndistortOptions()
-    rays = _rays(camera, o.grid)
+    rays = _rays(camera, GRID)
     if not np.isfinite(rays).all():
         return None
     x, y = rays[:, 0], rays[:, 1]
     xd, yd = camera.lens.distort(x, y)
     r2 = x * x + y * y
     columns = [
-        (x * r2, y * r2), (x * r2**2, y * r2**2), (2 * x * y, r2 + 2 * y * y), (r2 + 2 * x * x, 2 * x * y),
+        (x * r2, y * r2),
+        (x * r2**2, y * r2**2),
+        (2 * x * y, r2 + 2 * y * y),
+        (r2 + 2 * x * x, 2 * x * y),
         (x * r2**3, y * r2**3),
-    ]  # fmt: skip
+    ]
     matrix = np.stack([np.concatenate(column) for column in columns], axis=1)
     scale = np.abs(matrix).max(axis=0)
     terms = np.linalg.lstsq(matrix / scale, np.concatenate([xd - x, yd - y]), rcond=None)[0] / scale
     fitted = replace(camera, dist=terms, lens=None)
-    fine = _rays(camera, 2 * o.grid)
+    fine = _rays(camera, 2 * GRID)
     off = np.hypot(*np.moveaxis(fitted.project(fine) - camera.project(fine), -1, 0))
-    return fitted if np.isfinite(off).all() and off.max() <= o.max_fit_error_px else None
+    return fitted if np.isfinite(off).all() and off.max() <= MAX_FIT_ERROR_PX else None
 
 
 def require_brown(camera: Camera, what: str) -> Camera:
@@ -119,15 +122,15 @@ class Undistorter:
 
 def _covering_pinhole(camera: Camera, options: UndistortOptions) -> Camera:
     """A pinhole camera with the resolution of the picture's centre, for all of the picture that fits."""
-    rays = _rays(camera, options.grid)
+    rays = _rays(camera, GRID)
     rays = rays[np.isfinite(rays).all(axis=1), :2]
     if not len(rays):
         raise InputError("camera: the lens sees nothing in front of the camera; check its distortion terms")
-    limit = math.tan(math.radians(options.max_half_angle_deg))
+    limit = math.tan(math.radians(MAX_HALF_ANGLE_DEG))
     low, high = np.maximum(rays.min(axis=0), -limit), np.minimum(rays.max(axis=0), limit)
     # Where the picture reaches 90° or more, there are no rays at its border.
     is_wide = camera.lens is not None and camera.lens.model is not LensModel.RATIONAL
-    if is_wide and len(rays) < options.grid**2:
+    if is_wide and len(rays) < GRID**2:
         low, high = np.full(2, -limit), np.full(2, limit)
     step = 1e-4
     fx, fy = (camera.project(np.array([[step, 0.0, 1.0], [0.0, step, 1.0]])) - [camera.cx, camera.cy]).max(
@@ -162,7 +165,7 @@ class FrameView:
 
     def __init__(self, camera: Camera, options: UndistortOptions | None = None) -> None:
         self.camera = camera
-        brown = brown_camera(camera, options)
+        brown = brown_camera(camera)
         self._undistorter = Undistorter(camera, options) if brown is None else None
         self.tracked_camera = self._undistorter.ideal if self._undistorter is not None else brown or camera
 

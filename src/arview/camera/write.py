@@ -105,8 +105,15 @@ def _arview(camera: Camera, extra: dict[str, Any] | None = None) -> str:
 
 
 def _bop(camera: Camera) -> str:
-    record = {"cx": float(camera.cx), "cy": float(camera.cy), "depth_scale": 1.0, "fx": float(camera.fx),
-              "fy": float(camera.fy), "height": camera.height, "width": camera.width}  # fmt: skip
+    record = {
+        "cx": float(camera.cx),
+        "cy": float(camera.cy),
+        "depth_scale": 1.0,
+        "fx": float(camera.fx),
+        "fy": float(camera.fy),
+        "height": camera.height,
+        "width": camera.width,
+    }
     return json.dumps(record, indent=2) + "\n"
 
 

@@ -1,6 +1,7 @@
 """The command line: each command parses its options, calls one function of a library room and prints the result.
 
-There is a file for each command. Heavy libraries are imported inside the commands, so that ``arview --help`` is quick.
+There is a file for each command; other packages add commands of their own (docs/reference/plug-ins.md). Heavy libraries
+are imported inside the commands, so that ``arview --help`` is quick.
 """
 
 from arview.cli import (
@@ -9,7 +10,6 @@ from arview.cli import (
     calibrate,
     capture,
     check,
-    evaluate,
     export,
     guideviews,
     history,
@@ -18,21 +18,21 @@ from arview.cli import (
     measure,
     reconstruct,
     report,
-    study,
     verify,
     warmup,
 )
-from arview.cli.common import main
+from arview.cli.common import Command, Group, main
 from arview.cli.exit_codes import ExitCode
 
 __all__ = [
+    "Command",
     "ExitCode",
+    "Group",
     "annotate",
     "batch",
     "calibrate",
     "capture",
     "check",
-    "evaluate",
     "export",
     "guideviews",
     "history",
@@ -42,7 +42,6 @@ __all__ = [
     "measure",
     "reconstruct",
     "report",
-    "study",
     "verify",
     "warmup",
 ]

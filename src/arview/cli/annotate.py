@@ -74,10 +74,16 @@ class _Run(NamedTuple):
 
         with progress_bar("frames", self.frames.frame_count) as progress:
             return annotate_frames(
-                self.frames, session, overlay, self.sink, self.poses,
+                self.frames,
+                session,
+                overlay,
+                self.sink,
+                self.poses,
                 progress=lambda done, pose: progress(done, self.frames.frame_count or 0),
-                start_s=self.span_s[0], end_s=self.span_s[1], camera_of=self.camera_of if self.is_guessed else None,
-            )  # fmt: skip
+                start_s=self.span_s[0],
+                end_s=self.span_s[1],
+                camera_of=self.camera_of if self.is_guessed else None,
+            )
 
 
 def _parse_moment(ctx: click.Context, parameter: click.Parameter, value: str | None) -> int | float | None:
@@ -183,14 +189,25 @@ identity_reason, serial (read from a code), instance, and camera where none was 
 Ctrl-C ends the run and finishes the files.""",
 )
 @click.argument("source")
-@click.option("--part", "part_paths", required=True, multiple=True, metavar="PART",
-              help="Part file or CAD file; again for further parts.")  # fmt: skip
+@click.option(
+    "--part",
+    "part_paths",
+    required=True,
+    multiple=True,
+    metavar="PART",
+    help="Part file or CAD file; again for further parts.",
+)
 @click.option("--instances", type=click.IntRange(1, 16), default=1, metavar="N", help="Specimens of each part in view.")
 @click.option("--guideviews", "views_path", metavar="SET", help="Guide views; default: rendered and cached.")
 @click.option("--camera", "camera_spec", metavar="CAMERA", help="See below; without it the camera is guessed.")
 @click.option("--save-profile", "profile", metavar="NAME", help="Keep the estimated camera as a profile; see below.")
-@click.option("--inspection", "inspection_paths", multiple=True, metavar="FILE",
-              help="inspection.json whose values are drawn; again for further specimens, in their order.")  # fmt: skip
+@click.option(
+    "--inspection",
+    "inspection_paths",
+    multiple=True,
+    metavar="FILE",
+    help="inspection.json whose values are drawn; again for further specimens, in their order.",
+)
 @click.option("-o", "--output", metavar="OUT.mp4", help="Annotated video.")
 @click.option("--poses", "poses_path", metavar="OUT.jsonl", help="Pose of every frame.")
 @click.option("--init", metavar="WHERE", help="Pose of the first frame, or guide:NAME to align with; see below.")
@@ -198,21 +215,39 @@ Ctrl-C ends the run and finishes the files.""",
     "--learned", "learned_path", metavar="FILE", help="Learned views: read if the file exists, written at the end."
 )
 @click.option(
-    "--serial-at", expose_value=False, callback=_keep_named_part, metavar="FRAME:X,Y",
+    "--serial-at",
+    expose_value=False,
+    callback=_keep_named_part,
+    metavar="FRAME:X,Y",
     help="Frame and pixel of the part that the inspection belongs to; see below.",
-)  # fmt: skip
+)
 @click.option("--start", callback=_parse_moment, metavar="S", help="First frame: number, or seconds like 2.5s.")
 @click.option("--end", callback=_parse_moment, metavar="S", help="Frame to stop at: number, or seconds like 8s.")
 @click.option("--stride", type=click.IntRange(min=1), default=1, help="Take every N-th frame.", metavar="N")
 @click.option("--fps", type=float, default=30.0, show_default=True, help="Frame rate of a folder or glob of pictures.")
-@click.option("--show-edges", type=click.Choice(["none", "visible", "all"]), default="visible", show_default=True,
-              help="CAD edges to draw.")  # fmt: skip
+@click.option(
+    "--show-edges",
+    type=click.Choice(["none", "visible", "all"]),
+    default="visible",
+    show_default=True,
+    help="CAD edges to draw.",
+)
 @click.option("--no-ghost", is_flag=True, help="Leave out the translucent components.")
 @click.option("--no-labels", is_flag=True, help="Leave out the labels.")
-@click.option("--no-occlusion", is_flag=True, expose_value=False, callback=_keep_for_drawing,
-              help="Draw over hands and tools before the part, too.")  # fmt: skip
-@click.option("--no-legend", is_flag=True, expose_value=False, callback=_keep_for_drawing,
-              help="Leave out the legend of components that are not as measured.")  # fmt: skip
+@click.option(
+    "--no-occlusion",
+    is_flag=True,
+    expose_value=False,
+    callback=_keep_for_drawing,
+    help="Draw over hands and tools before the part, too.",
+)
+@click.option(
+    "--no-legend",
+    is_flag=True,
+    expose_value=False,
+    callback=_keep_for_drawing,
+    help="Leave out the legend of components that are not as measured.",
+)
 @click.option("--check-presence", is_flag=True, help="Exit by whether all components were seen in place; see below.")
 @click.option("--opacity", type=click.FloatRange(0.0, 1.0), help="Opacity of the translucent components, 0 to 1.")
 @MODALITY

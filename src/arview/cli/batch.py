@@ -13,7 +13,7 @@ from arview.cli.common import main, say
 from arview.cli.exit_codes import ExitCode, exit_code_of
 
 if TYPE_CHECKING:
-    from arview.workflow.batch import JobResult
+    from arview.quality.batch.run import JobResult
 
 
 @main.command(
@@ -65,29 +65,56 @@ The exit code is the worst result of all jobs, in the order 3, 1, 2, 0.""",
 )
 @click.argument("jobs_path", metavar="JOBS.toml")
 @click.option("--scheduler", metavar="URL", help="tcp://host:port of a Dask scheduler; default: local workers.")
-@click.option("--workers", type=click.IntRange(min=1), metavar="N",
-              help="Local workers; default: one per two cores, as far as memory allows.")  # fmt: skip
-@click.option("--memory-limit", default="4GB", show_default=True, metavar="SIZE",
-              help="Memory per local job; a job that takes more is stopped.")  # fmt: skip
-@click.option("--retries", type=click.IntRange(min=0), default=2, show_default=True, metavar="N",
-              help="Retries of a job that was stopped.")  # fmt: skip
-@click.option("--connect-s", type=click.FloatRange(min=0.1), default=15.0, show_default=True, metavar="S",
-              help="Seconds to wait for a scheduler.")  # fmt: skip
+@click.option(
+    "--workers",
+    type=click.IntRange(min=1),
+    metavar="N",
+    help="Local workers; default: one per two cores, as far as memory allows.",
+)
+@click.option(
+    "--memory-limit",
+    default="4GB",
+    show_default=True,
+    metavar="SIZE",
+    help="Memory per local job; a job that takes more is stopped.",
+)
+@click.option(
+    "--retries",
+    type=click.IntRange(min=0),
+    default=2,
+    show_default=True,
+    metavar="N",
+    help="Retries of a job that was stopped.",
+)
+@click.option(
+    "--connect-s",
+    type=click.FloatRange(min=0.1),
+    default=15.0,
+    show_default=True,
+    metavar="S",
+    help="Seconds to wait for a scheduler.",
+)
 @click.option("--store", metavar="FILE|URL", help="Also add the results to this store (`arview history`).")
 @click.option("--station", metavar="NAME", help="Name of the measuring station.")
 def batch(
-    jobs_path: str, scheduler: str | None, workers: int | None, memory_limit: str, retries: int, connect_s: float,
-    store: str | None, station: str | None,
-) -> None:  # fmt: skip
+    jobs_path: str,
+    scheduler: str | None,
+    workers: int | None,
+    memory_limit: str,
+    retries: int,
+    connect_s: float,
+    store: str | None,
+    station: str | None,
+) -> None:
     """Inspect all parts that JOBS.toml names."""
     from tqdm import tqdm
 
-    from arview.workflow.batch import BatchOptions, run_batch
-    from arview.workflow.jobs_file import load_jobs
+    from arview.quality.batch.jobs_file import load_jobs
+    from arview.quality.batch.run import BatchOptions, run_batch
 
     jobs = load_jobs(jobs_path)
     if store is not None:
-        from arview.history import HistoryStore
+        from arview.quality.history import HistoryStore
 
         HistoryStore(store).close()
     options = BatchOptions(scheduler, workers or 0, memory_limit, retries, connect_s)
@@ -105,8 +132,11 @@ def batch(
         _add(results, store, station)
     counts = Counter(one.verdict.replace("_", " ") for one in results)
     kept = sum(one.is_kept for one in results)
-    click.echo(f"{len(results)} jobs: " + ", ".join(f"{count} {verdict}" for verdict, count in counts.most_common())
-               + (f"; {kept} of them already done" if kept else ""))  # fmt: skip
+    click.echo(
+        f"{len(results)} jobs: "
+        + ", ".join(f"{count} {verdict}" for verdict, count in counts.most_common())
+        + (f"; {kept} of them already done" if kept else "")
+    )
     click.get_current_context().exit(worst_exit_code(results))
 
 
@@ -124,8 +154,8 @@ def _line(result: JobResult) -> str:
 
 def _add(results: list[JobResult], store: str, station: str | None) -> None:
     """Add the results to the store; those already there stay as they are."""
-    from arview.history import HistoryStore
-    from arview.workflow.storage import read
+    from arview.quality.batch.storage import read
+    from arview.quality.history import HistoryStore
 
     with HistoryStore(store) as opened, tempfile.TemporaryDirectory() as folder:
         new = 0

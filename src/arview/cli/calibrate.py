@@ -63,8 +63,13 @@ rulers on the page show whether the printer kept the scale. The page also states
 `arview calibrate --board`.""",
 )
 @click.option("-o", "--output", required=True, metavar="PDF", help="File to write.")
-@click.option("--paper", default="A4", show_default=True, metavar="SIZE",
-              help="A4 to A0, letter, tabloid (landscape), or WIDTHxHEIGHT in mm.")  # fmt: skip
+@click.option(
+    "--paper",
+    default="A4",
+    show_default=True,
+    metavar="SIZE",
+    help="A4 to A0, letter, tabloid (landscape), or WIDTHxHEIGHT in mm.",
+)
 @click.option("--squares", metavar="COLUMNSxROWS", help="Number of squares.  [default: 11x8]")
 @click.option("--board", "board_spec", metavar="SPEC", help="charuco:COLUMNSxROWS:SQUARE_MM:MARKER_MM:DICTIONARY.")
 def board(output: str, paper: str, squares: str | None, board_spec: str | None) -> None:
@@ -115,15 +120,32 @@ what took them. `arview calibrate profiles` lists them. An insufficient calibrat
     },
 )
 @click.argument("sources", nargs=-1, required=True, metavar="PHOTOS...|VIDEO")
-@click.option("--board", "board_spec", required=True, metavar="SPEC",
-              help="charuco:COLUMNSxROWS:SQUARE_MM:MARKER_MM:DICTIONARY, as printed on the board.")  # fmt: skip
+@click.option(
+    "--board",
+    "board_spec",
+    required=True,
+    metavar="SPEC",
+    help="charuco:COLUMNSxROWS:SQUARE_MM:MARKER_MM:DICTIONARY, as printed on the board.",
+)
 @click.option("-o", "--output", "outputs", multiple=True, metavar="[FORMAT:]CAMERA", help="Camera file to write.")
 @click.option("--profile", is_flag=False, flag_value="", metavar="[NAME]", help="Also store it as a profile.")
 @click.option("--plot", metavar="PNG", help="Plot corners, residuals and uncertainty over the picture (png, svg, pdf).")
-@click.option("--lens", "lens_model", type=click.Choice(["brown", "fisheye"]), default="brown", show_default=True,
-              help="Lens model: k1 k2 p1 p2 k3, or OpenCV's fisheye; the report says which fits.")  # fmt: skip
-@click.option("--max-views", type=click.IntRange(min=5), default=40, show_default=True, metavar="N",
-              help="Views to calibrate from; the most informative ones are chosen.")  # fmt: skip
+@click.option(
+    "--lens",
+    "lens_model",
+    type=click.Choice(["brown", "fisheye"]),
+    default="brown",
+    show_default=True,
+    help="Lens model: k1 k2 p1 p2 k3, or OpenCV's fisheye; the report says which fits.",
+)
+@click.option(
+    "--max-views",
+    type=click.IntRange(min=5),
+    default=40,
+    show_default=True,
+    metavar="N",
+    help="Views to calibrate from; the most informative ones are chosen.",
+)
 @click.option("--anyway", is_flag=True, help="Write the camera even if the views are not enough.")
 def lens(
     sources: tuple[str, ...],
@@ -261,10 +283,13 @@ def _camera_lines(result: Calibration) -> list[str]:
     cells = [
         f"{name} {value:{form}} ± {2 * std:{form}}"
         for name, value, std, form in zip(
-            solution.parameters, intrinsics_of(result.camera), solution.std,
-            [".2f"] * 4 + [".5f"] * (len(solution.parameters) - 4), strict=True,
+            solution.parameters,
+            intrinsics_of(result.camera),
+            solution.std,
+            [".2f"] * 4 + [".5f"] * (len(solution.parameters) - 4),
+            strict=True,
         )
-    ]  # fmt: skip
+    ]
     worst = f"{verdict.pixel_u_px[0]:.2f} px in the median, {verdict.pixel_u_px[1]:.2f} px at worst"
     return [
         f"camera: {', '.join(cells[:4])} px",

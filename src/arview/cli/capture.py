@@ -27,12 +27,12 @@ from arview.cli.exit_codes import ExitCode
 if TYPE_CHECKING:
     from arview.cad import Part
     from arview.camera import Camera
-    from arview.capture import CaptureAdvice
     from arview.core.progress import StepProgress
     from arview.geometry import Array
     from arview.guideviews import GuideViewSet
+    from arview.station.capture import CaptureAdvice
+    from arview.station.walk.job import JobFolder
     from arview.tracking import TrackingSession
-    from arview.workflow.walk.job import JobFolder
 
 SAID_EVERY_S = 3.0
 """Time between two lines that say where to go, with a camera."""
@@ -106,8 +106,8 @@ def capture(
     from arview.camera.write import write_camera
     from arview.guideviews import GuideViewOptions
     from arview.guideviews.cache import cached_guide_views
+    from arview.station.walk.capture import capture_options, capture_photos, open_folder, summary_lines
     from arview.video import open_source
-    from arview.workflow.capture import capture_options, capture_photos, open_folder, summary_lines
 
     part = load_part(part_path, unit)
     first_pose = load_pose(init) if init else None

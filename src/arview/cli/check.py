@@ -31,8 +31,9 @@ Examples:
 @click.argument("part")
 @UNIT
 @click.option("--camera", "camera_spec", metavar="CAMERA", help="Camera file or fov:DEG, for sizes in pixels.")
-@click.option("--against", "others", multiple=True, metavar="PART",
-              help="Another part it might be taken for; may be repeated.")  # fmt: skip
+@click.option(
+    "--against", "others", multiple=True, metavar="PART", help="Another part it might be taken for; may be repeated."
+)
 def check(part: str, unit: str | None, camera_spec: str | None, others: tuple[str, ...]) -> None:
     """Print what PART consists of, and what will be hard about finding and tracking it.
 

@@ -18,6 +18,7 @@ import click
 
 from arview.cli.exit_codes import ExitCode, help_rows
 from arview.core.atomic import is_device
+from arview.core.plug_ins import find_plug_ins, load_plug_in
 from arview.core.progress import Progress, StepProgress
 from arview.errors import ArviewError, CannotMeasureError, InputError, OutputError, is_interruption, without_credentials
 from arview.version import __version__
@@ -31,6 +32,8 @@ if TYPE_CHECKING:
     from arview.tracking.self_calibration.session import MakeSession, SelfCalibratingSession
     from arview.video import FrameSource
 
+COMMANDS_GROUP = "arview.commands"
+"""Entry-point group of commands that other packages add."""
 MODALITIES = ("region", "edge", "feature")
 _STORAGE_ERRORS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS})
 
@@ -65,10 +68,40 @@ def _write_exit_codes(formatter: click.HelpFormatter, rows: list[tuple[str, str]
         formatter.write_dl(rows)
 
 
+class _UnusableCommand(Command):
+    """Stands in for a command of another package that cannot be loaded, so that the help still names it."""
+
+    def __init__(self, name: str, error: InputError) -> None:
+        super().__init__(name, short_help="Cannot be loaded; run it to see why.", add_help_option=False)
+        self.error = error
+
+    def make_context(self, *args: Any, **options: Any) -> click.Context:
+        """Raise the error, whatever the arguments are."""
+        raise self.error
+
+
 class _Program(Group):
     """The whole program: every way to end is turned into an exit code and at most one line on stderr."""
 
     group_class = Group
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """Names of arview's own commands and of those that other packages add, in alphabetical order."""
+        return sorted({*super().list_commands(ctx), *find_plug_ins(COMMANDS_GROUP)})
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """A command by name. Packages are searched and imported only for a name that arview does not have itself."""
+        own = super().get_command(ctx, cmd_name)
+        if own is not None:
+            return own
+        entry = find_plug_ins(COMMANDS_GROUP).get(cmd_name)
+        if entry is None:
+            return None
+        try:
+            command: click.Command = load_plug_in(entry, click.Command)
+        except InputError as error:
+            return _UnusableCommand(cmd_name, error)
+        return command
 
     def make_context(self, *args: Any, **options: Any) -> click.Context:
         """Parse the options; --help prints here."""
@@ -223,7 +256,6 @@ Examples:
   arview annotate clip.mp4 --part part.toml --camera camera.json --inspection inspection.json
   arview reconstruct photos/ --part part.toml -o out/
   arview live --part part.toml --inspection inspection.json
-  arview evaluate bop/castle --init truth
 
 \b
 PART is a part file (part.toml; `arview check --help` shows one) or a CAD file (STEP, glTF, OBJ,

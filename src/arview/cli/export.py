@@ -49,8 +49,14 @@ inspection that report and results store show. The fields of inspection.json are
 src/arview/inspection/schema/inspection-json.md and by the JSON Schema next to it.""",
 )
 @click.argument("inspection", metavar="INSPECTION")
-@click.option("--to", "formats", callback=_parse_formats, required=True, metavar="LIST",
-              help="csv, qif, dfq, glb, html, pdf, decisions, separated by commas.")  # fmt: skip
+@click.option(
+    "--to",
+    "formats",
+    callback=_parse_formats,
+    required=True,
+    metavar="LIST",
+    help="csv, qif, dfq, glb, html, pdf, decisions, separated by commas.",
+)
 @click.option("-o", "--output", metavar="FILE|FOLDER", help="File to write, or folder; default: next to INSPECTION.")
 @click.option("--part", "part_path", metavar="PART", help="Part file or CAD file, for glb, html and pdf.")
 @click.option("--folder", metavar="OUT", help="Folder of `arview reconstruct`, for html and pdf.")
@@ -67,11 +73,11 @@ def export(
 ) -> None:
     """Write INSPECTION in other formats."""
     from arview.cad import load_part
-    from arview.decisions import decisions_csv, log_of
-    from arview.decisions.table import decided_cells
     from arview.inspection import load_inspection
     from arview.inspection.export import to_csv, to_dfq, to_glb
     from arview.inspection.fingerprint import fingerprint_of_file
+    from arview.quality.decisions import decisions_csv, log_of
+    from arview.quality.decisions.table import decided_cells
 
     if "qif" in formats:
         from arview.inspection.export import to_qif
@@ -111,7 +117,7 @@ def export(
 
 def _targets(source: Path, formats: tuple[str, ...], output: str | None, part_path: str | None) -> dict[str, Path]:
     """The file of each format; a folder that is not there is made where the name ends in / or has no ending."""
-    from arview.decisions import log_of
+    from arview.quality.decisions import log_of
 
     inputs = [source, part_path]
     folder = source.parent if output is None else Path(output)

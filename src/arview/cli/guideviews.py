@@ -118,8 +118,9 @@ the commands check, guideviews and annotate.""",
 @click.option(
     "--port", type=click.IntRange(0, 65535), default=8460, show_default=True, help="Port of the page; 0: any."
 )
-@click.option("--against", "others", multiple=True, metavar="PART",
-              help="Another part it might be taken for; may be repeated.")  # fmt: skip
+@click.option(
+    "--against", "others", multiple=True, metavar="PART", help="Another part it might be taken for; may be repeated."
+)
 @UNIT
 @click.option("--no-browser", is_flag=True, help="Print the address, open no browser.")
 def studio(part: str, port: int, others: tuple[str, ...], unit: str | None, no_browser: bool) -> None:
@@ -134,8 +135,8 @@ def studio(part: str, port: int, others: tuple[str, ...], unit: str | None, no_b
 
     require_extra("arview studio", "station")
     from arview.cad import load_part
-    from arview.studio.document import StudioDocument
-    from arview.studio.server import StudioServer
+    from arview.station.studio.document import StudioDocument
+    from arview.station.studio.server import StudioServer
 
     server = StudioServer(StudioDocument(part, unit), port, [load_part(other, unit) for other in others])
 

@@ -17,8 +17,8 @@ from arview.core.extras import require
 from arview.errors import ArviewError, InputError
 
 if TYPE_CHECKING:
-    from arview.decisions import Decision, RecordState
-    from arview.history import Capability, ComponentSeries, ControlChart, HistoryStore, StoredResult
+    from arview.quality.decisions import Decision, RecordState
+    from arview.quality.history import Capability, ComponentSeries, ControlChart, HistoryStore, StoredResult
 
 _SHOWN_CHANGES = 8
 _QUANTITIES = ("distance", "dx", "dy", "dz", "tilt", "twist")
@@ -252,11 +252,11 @@ def chart(
     output: str | None, zone: tzinfo, part: str | None, station: str | None, since: str | None, store: str | None,
 ) -> None:  # fmt: skip
     """Show the trend of a component over the parts, with control limits, Cp and Cpk."""
-    from arview.history import Capability, capability_by_limits, control_chart, series_of
+    from arview.quality.history import Capability, capability_by_limits, control_chart, series_of
 
     if output is not None:
         require("a figure", "matplotlib")
-    from arview.history.chart import FORMATS, draw
+    from arview.quality.history.chart import FORMATS, draw
 
     target = None if output is None else output_path(output, [])
     if target is not None and target.suffix.lstrip(".").lower() not in FORMATS:
@@ -307,7 +307,7 @@ def _print_capability(
     ability: Capability | InputError, series: ComponentSeries, limits: tuple[float | None, float | None] | None
 ) -> None:
     """Print the indices of the values with these limits; of all values with None."""
-    from arview.history.series import limits_text
+    from arview.quality.history.series import limits_text
 
     lead = ""
     if limits is not None:
@@ -344,7 +344,7 @@ def export(
     store: str | None,
 ) -> None:  # fmt: skip
     """Write results to a file; its times are UTC."""
-    from arview.history.export import to_csv, to_json_lines
+    from arview.quality.history.export import to_csv, to_json_lines
 
     target = output_path(output, [])
     kind = target.suffix.lower()
@@ -395,7 +395,7 @@ def list_decisions(
     store: str | None,
 ) -> None:  # fmt: skip
     """List the decisions, ticks and signatures about the results."""
-    from arview.decisions import decisions_csv
+    from arview.quality.decisions import decisions_csv
 
     target = None if output is None else output_path(output, [])
     with _open(store, must_exist=True) as opened:
@@ -413,7 +413,7 @@ def list_decisions(
 
 
 def _print_decisions(rows: Sequence[tuple[StoredResult, Decision]], zone: tzinfo) -> None:
-    from arview.decisions.table import decision_word
+    from arview.quality.decisions.table import decision_word
 
     cells: list[tuple[str, ...]] = []
     for result, one in rows:
@@ -447,7 +447,7 @@ def _decided_word(state: RecordState | None) -> str:
 
 
 def _open(store: str | None, must_exist: bool = False) -> HistoryStore:
-    from arview.history import HistoryStore, default_store
+    from arview.quality.history import HistoryStore, default_store
 
     return HistoryStore(store or default_store(), must_exist)
 

@@ -73,27 +73,54 @@ A video or PDF that cannot be made is a warning: the verdict stands without it."
 @click.option("--camera", metavar="CAMERA", help="Calibrated camera file of the photos, or fov:DEG.")
 @click.option("--video-camera", metavar="CAMERA", help="The same for the video, if it was taken with another camera.")
 @click.option("--scale-file", metavar="FILE", help="TOML file of the boards, tags, scale bars and rig in view.")
-@click.option("--masks", metavar="FOLDER|auto",
-              help="Masks as IMAGE.png, black where a photo is not to be used; auto: made of the CAD.")  # fmt: skip
-@click.option("--sparse", metavar="FOLDER|FILE",
-              help="Camera poses made elsewhere: COLMAP model, Metashape XML or transforms.json.")  # fmt: skip
-@click.option("--pairs", metavar="FILE",
-              help="Match only the pairs of photos that another run matched: its sparse/pairs.json.")  # fmt: skip
-@click.option("--tolerance", type=click.FloatRange(min=0, min_open=True), metavar="MM",
-              help="Tolerance of components that have none in the part file.")  # fmt: skip
-@click.option("--guard", type=click.FloatRange(0, 3), default=1.0, show_default=True, metavar="G",
-              help="Guard band as a multiple of U; 0 is simple acceptance.")  # fmt: skip
-@click.option("--max-frames", type=click.IntRange(min=3), default=60, show_default=True, metavar="N",
-              help="Frames to measure of a video without photos.")  # fmt: skip
-@click.option("--no-repeatability", is_flag=True,
-              help="Do not measure two halves of the photos apart to compare them.")  # fmt: skip
+@click.option(
+    "--masks",
+    metavar="FOLDER|auto",
+    help="Masks as IMAGE.png, black where a photo is not to be used; auto: made of the CAD.",
+)
+@click.option(
+    "--sparse",
+    metavar="FOLDER|FILE",
+    help="Camera poses made elsewhere: COLMAP model, Metashape XML or transforms.json.",
+)
+@click.option(
+    "--pairs", metavar="FILE", help="Match only the pairs of photos that another run matched: its sparse/pairs.json."
+)
+@click.option(
+    "--tolerance",
+    type=click.FloatRange(min=0, min_open=True),
+    metavar="MM",
+    help="Tolerance of components that have none in the part file.",
+)
+@click.option(
+    "--guard",
+    type=click.FloatRange(0, 3),
+    default=1.0,
+    show_default=True,
+    metavar="G",
+    help="Guard band as a multiple of U; 0 is simple acceptance.",
+)
+@click.option(
+    "--max-frames",
+    type=click.IntRange(min=3),
+    default=60,
+    show_default=True,
+    metavar="N",
+    help="Frames to measure of a video without photos.",
+)
+@click.option("--no-repeatability", is_flag=True, help="Do not measure two halves of the photos apart to compare them.")
 @click.option("--no-pdf", is_flag=True, help="Write the report as HTML only.")
 @click.option(
     "--seed", type=click.IntRange(min=0), default=0, show_default=True, help="The same seed gives the same cloud."
 )
 @click.option("--threads", type=click.IntRange(min=0), default=0, metavar="N", help="Threads; default: all cores.")
-@click.option("--device", default="auto", show_default=True, metavar="auto|cpu|cuda[:N]",
-              help="Device for features, matching and the dense cloud, see `arview reconstruct --help`.")  # fmt: skip
+@click.option(
+    "--device",
+    default="auto",
+    show_default=True,
+    metavar="auto|cpu|cuda[:N]",
+    help="Device for features, matching and the dense cloud, see `arview reconstruct --help`.",
+)
 @click.option("--force", is_flag=True, help="Repeat all stages, even those already finished in OUT.")
 @UNIT
 def inspect(
@@ -126,18 +153,35 @@ def inspect(
     from arview.workflow.run import inspect_part
 
     job = InspectJob(
-        part_path, photos, video, serial, camera, video_camera, scale_file, unit, masks, sparse, tolerance,
-        guard, max_frames, seed, threads, device, not no_pdf, not no_repeatability, pairs,
-    )  # fmt: skip
+        part_path,
+        photos,
+        video,
+        serial=serial,
+        camera=camera,
+        video_camera=video_camera,
+        scale_file=scale_file,
+        unit=unit,
+        masks=masks,
+        sparse=sparse,
+        tolerance_mm=tolerance,
+        guard=guard,
+        max_frames=max_frames,
+        seed=seed,
+        threads=threads,
+        device=device,
+        makes_pdf=not no_pdf,
+        compares_halves=not no_repeatability,
+        pairs=pairs,
+    )
     if store is not None:
-        from arview.history import HistoryStore
+        from arview.quality.history import HistoryStore
 
         HistoryStore(store).close()  # a store that cannot be used is reported now, not after the measurement
     with line_bar(video is not None, photos is None, not no_pdf) as progress:
         outcome = inspect_part(job, output, progress=progress, starts_over=force)
     print_outcome(outcome)
     if store is not None:
-        from arview.history import HistoryStore
+        from arview.quality.history import HistoryStore
 
         with HistoryStore(store) as opened:
             added = opened.add(outcome.folder / "inspection.json", station)

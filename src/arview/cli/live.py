@@ -21,9 +21,9 @@ from arview.core.extras import require, require_extra
 from arview.errors import InputError, MissingDependencyError
 
 if TYPE_CHECKING:
-    from arview.live.server.hub import Hub
-    from arview.live.server.live_server import LiveServer
-    from arview.live.stream.subjects import Subjects
+    from arview.station.live.server.hub import Hub
+    from arview.station.live.server.live_server import LiveServer
+    from arview.station.live.stream.subjects import Subjects
 
 STOP_DEADLINE_S = 4.6
 """Time from a signal to the end of the program, whatever its workers do."""
@@ -68,7 +68,7 @@ def _keep_device_option(ctx: click.Context, parameter: click.Parameter, value: b
 
 def _list_devices() -> None:
     """Print the paired devices."""
-    from arview.live.security.devices import devices_path, read_devices
+    from arview.station.live.security.devices import devices_path, read_devices
 
     devices = read_devices(devices_path())
     width = max((len(one.name) for one in devices), default=0)
@@ -80,7 +80,7 @@ def _list_devices() -> None:
 
 def _revoke_devices(names: tuple[str, ...]) -> None:
     """Forget paired devices. Raises InputError for a name that none has."""
-    from arview.live.security.devices import Devices, devices_path
+    from arview.station.live.security.devices import Devices, devices_path
 
     devices = Devices(devices_path())
     for name in dict.fromkeys(names):
@@ -148,12 +148,23 @@ the folder reach --quota or the disk is almost full. Ctrl-C ends the run and fin
 seconds.""",
     exit_codes={ExitCode.INTERRUPTED: "ended by Ctrl-C; files are finished"},
 )
-@click.option("--part", "part_paths", required=True, multiple=True, metavar="PART",
-              help="Part file or CAD file; again for further parts.")  # fmt: skip
+@click.option(
+    "--part",
+    "part_paths",
+    required=True,
+    multiple=True,
+    metavar="PART",
+    help="Part file or CAD file; again for further parts.",
+)
 @click.option("--instances", type=click.IntRange(1, 16), default=1, metavar="N", help="Specimens of each part in view.")
 @click.option("--guideviews", "views_path", metavar="SET", help="Guide views; default: rendered and cached.")
-@click.option("--inspection", "inspection_paths", multiple=True, metavar="FILE",
-              help="inspection.json whose values are shown; again for further specimens, in their order.")  # fmt: skip
+@click.option(
+    "--inspection",
+    "inspection_paths",
+    multiple=True,
+    metavar="FILE",
+    help="inspection.json whose values are shown; again for further specimens, in their order.",
+)
 @click.option(
     "--source", default="phone", show_default=True, metavar="SOURCE", help="Camera or video to show; see below."
 )
@@ -164,29 +175,74 @@ seconds.""",
 @click.option(
     "--host", metavar="ADDRESS", help="Address to listen at; default: the one in the local network. 0.0.0.0: all."
 )
-@click.option("--port", type=click.IntRange(0, 65534), default=8443, show_default=True,
-              help="Port of the pages; the page about the certificate gets the next one.")  # fmt: skip
+@click.option(
+    "--port",
+    type=click.IntRange(0, 65534),
+    default=8443,
+    show_default=True,
+    help="Port of the pages; the page about the certificate gets the next one.",
+)
 @click.option("--http", "is_plain", is_flag=True, help="Plain HTTP for a browser on this machine.")
 @click.option("--cert", metavar="PEM", type=click.Path(path_type=Path), help="Your own certificate chain.")
 @click.option("--key", metavar="PEM", type=click.Path(path_type=Path), help="Key of that certificate.")
-@click.option("--clients", type=click.IntRange(1, 64), metavar="N",
-              help="Most pages at once; default: 2 phones, or 8 pages of a station camera.")  # fmt: skip
+@click.option(
+    "--clients",
+    type=click.IntRange(1, 64),
+    metavar="N",
+    help="Most pages at once; default: 2 phones, or 8 pages of a station camera.",
+)
 @click.option("--record", metavar="OUT.mp4", help="Record from the start; the video of a second phone is OUT-2.mp4.")
-@click.option("--quota", type=click.FloatRange(0, min_open=True), default=20.0, show_default=True, metavar="GB",
-              help="Largest size of all recordings in their folder.")  # fmt: skip
+@click.option(
+    "--quota",
+    type=click.FloatRange(0, min_open=True),
+    default=20.0,
+    show_default=True,
+    metavar="GB",
+    help="Largest size of all recordings in their folder.",
+)
 @click.option("--serial", metavar="TEXT", help="Serial number of the part in view; default: that of the part file.")
-@click.option("--max-age", callback=_parse_age, default="24h", show_default=True, metavar="AGE",
-              help="Age from which an inspection is called old: 8h, 3d, 90min, never.")  # fmt: skip
-@click.option("--jobs", "jobs", metavar="FOLDER", type=click.Path(file_okay=False),
-              default="arview_jobs", show_default=True,
-              help="Folder of the inspections that pages start; it is made with the first one.")  # fmt: skip
-@click.option("--devices", is_flag=True, is_eager=True, expose_value=False, callback=_keep_device_option,
-              help="List the paired phones and screens, and exit.")  # fmt: skip
-@click.option("--revoke", metavar="NAME", multiple=True, is_eager=True, expose_value=False,
-              callback=_keep_device_option,
-              help="Forget a paired device, of a running station too, and exit; may be given again.")  # fmt: skip
-@click.option("--size", callback=_parse_size, default="1280x720", show_default=True, metavar="WxH",
-              help="Size of the phone's pictures in landscape.")  # fmt: skip
+@click.option(
+    "--max-age",
+    callback=_parse_age,
+    default="24h",
+    show_default=True,
+    metavar="AGE",
+    help="Age from which an inspection is called old: 8h, 3d, 90min, never.",
+)
+@click.option(
+    "--jobs",
+    "jobs",
+    metavar="FOLDER",
+    type=click.Path(file_okay=False),
+    default="arview_jobs",
+    show_default=True,
+    help="Folder of the inspections that pages start; it is made with the first one.",
+)
+@click.option(
+    "--devices",
+    is_flag=True,
+    is_eager=True,
+    expose_value=False,
+    callback=_keep_device_option,
+    help="List the paired phones and screens, and exit.",
+)
+@click.option(
+    "--revoke",
+    metavar="NAME",
+    multiple=True,
+    is_eager=True,
+    expose_value=False,
+    callback=_keep_device_option,
+    help="Forget a paired device, of a running station too, and exit; may be given again.",
+)
+@click.option(
+    "--size",
+    callback=_parse_size,
+    default="1280x720",
+    show_default=True,
+    metavar="WxH",
+    help="Size of the phone's pictures in landscape.",
+)
 @click.option("--fps", type=float, default=30.0, show_default=True, help="Frame rate of the phone's pictures.")
 @RENDERER
 @UNIT
@@ -222,9 +278,9 @@ def live(
     import asyncio
 
     require_extra("arview live", "station")
-    from arview.live.options import JobOptions, LiveOptions, RecordingOptions
-    from arview.live.security.devices import devices_path
-    from arview.live.server.live_server import LiveServer, open_endpoint
+    from arview.station.live.options import JobOptions, LiveOptions, RecordingOptions
+    from arview.station.live.security.devices import devices_path
+    from arview.station.live.server.live_server import LiveServer, open_endpoint
 
     check_profile(profile, camera_spec)
     _check_inputs(part_paths, source)
@@ -258,7 +314,7 @@ def live(
     _tell_logs()
     server = LiveServer(options, open_endpoint(host, port, is_plain, cert, key))
     from arview.guideviews import GuideViewOptions
-    from arview.live.server.loading import load_subjects
+    from arview.station.live.server.loading import load_subjects
 
     def load() -> Subjects:
         with progress_bar("guide views") as progress:
@@ -340,7 +396,7 @@ def _leave_threads() -> None:
 
 
 async def _serve(server: LiveServer, load: Callable[[], Subjects]) -> None:
-    from arview.live.server.loading import warm_up
+    from arview.station.live.server.loading import warm_up
 
     def ready(hub: Hub) -> None:
         gc.collect()
@@ -363,7 +419,7 @@ def _print_welcome(server: LiveServer) -> None:
     certificates = endpoint.certificates
     click.echo(f"page:  {server.link}")
     if endpoint.trust_link is not None and certificates is not None and certificates.authority_der is not None:
-        from arview.live.security.trust_page import fingerprint
+        from arview.station.live.security.trust_page import fingerprint
 
         click.echo(f"first time on a phone:  {endpoint.trust_link}")
         click.echo(f"fingerprint:  {fingerprint(certificates.authority_der)}")
@@ -396,7 +452,7 @@ def _tell_logs() -> None:
                 text += f": {type(record.exc_info[1]).__name__}: {record.exc_info[1]}"
             say(f"{record.levelname.lower()}: {text}")
 
-    logger = logging.getLogger("arview.live")
+    logger = logging.getLogger("arview.station.live")
     logger.addHandler(Lines())
     logger.setLevel(logging.INFO)
     logger.propagate = False

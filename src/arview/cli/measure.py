@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import click
 
@@ -68,8 +68,12 @@ INSPECTION_distances: coloured PLY, a picture, histograms.""",
     },
 )
 @click.argument("folder", metavar="[OUT]", required=False)
-@click.option("--cloud", "cloud_path", metavar="FILE",
-              help="Measure a cloud instead, in any frame: PLY, PCD, XYZ, PTS, CSV, LAS, LAZ or E57.")  # fmt: skip
+@click.option(
+    "--cloud",
+    "cloud_path",
+    metavar="FILE",
+    help="Measure a cloud instead, in any frame: PLY, PCD, XYZ, PTS, CSV, LAS, LAZ or E57.",
+)
 @click.option("--cloud-unit", metavar="UNIT", help="Unit of the cloud: mm, cm, m, inch, ft, um; default: by its size.")
 @click.option(
     "--rescale", is_flag=True, help="Divide the cloud by the factor by which it is larger than the CAD's base."
@@ -77,14 +81,28 @@ INSPECTION_distances: coloured PLY, a picture, histograms.""",
 @click.option("--part", "part_path", required=True, metavar="PART", help="Part file or CAD file.")
 @click.option("-o", "--output", metavar="INSPECTION", help="File to write; default: inspection.json in OUT.")
 @click.option("--photos", metavar="FOLDER", help="Folder of the photos, if they were moved.")
-@click.option("--tolerance", type=click.FloatRange(min=0, min_open=True), metavar="MM",
-              help="Tolerance of components that have none in the part file.")  # fmt: skip
-@click.option("--guard", type=click.FloatRange(0, 3), default=1.0, show_default=True, metavar="G",
-              help="Guard band as a multiple of U; 0 is simple acceptance.")  # fmt: skip
-@click.option("--methods", callback=_parse_methods, default=",".join(METHODS), show_default=True, metavar="LIST",
-              help="Measuring methods, separated by commas.")  # fmt: skip
-@click.option("--registration", type=click.Choice(["surface", "icp"]), default="surface", show_default=True,
-              help="In the cloud: to the CAD's exact surface, or by classical ICP, for comparison.")  # fmt: skip
+@click.option(
+    "--tolerance",
+    type=click.FloatRange(min=0, min_open=True),
+    metavar="MM",
+    help="Tolerance of components that have none in the part file.",
+)
+@click.option(
+    "--guard",
+    type=click.FloatRange(0, 3),
+    default=1.0,
+    show_default=True,
+    metavar="G",
+    help="Guard band as a multiple of U; 0 is simple acceptance.",
+)
+@click.option(
+    "--methods",
+    callback=_parse_methods,
+    default=",".join(METHODS),
+    show_default=True,
+    metavar="LIST",
+    help="Measuring methods, separated by commas.",
+)
 @click.option("--correct-bias", is_flag=True, help="Correct distances for the bias that noise gives small ones.")
 @click.option("--no-monte-carlo", is_flag=True, help="Combine uncertainties by root sum of squares only.")
 @click.option("--no-maps", is_flag=True, help="Do not write the pictures and the PLY of the distance map.")
@@ -104,7 +122,6 @@ def measure(
     tolerance: float | None,
     guard: float,
     methods: tuple[Method, ...],
-    registration: Literal["surface", "icp"],
     correct_bias: bool,
     no_monte_carlo: bool,
     no_maps: bool,
@@ -132,7 +149,6 @@ def measure(
     options = MeasureOptions(
         methods=methods,
         tolerance_mm=tolerance,
-        registration=registration,
         corrects_bias=correct_bias,
         uses_inconsistent=anyway,
         maps_folder=None if no_maps else target.parent / f"{target.stem}_distances",
@@ -182,8 +198,10 @@ def _print(inspection: Inspection, target: Path) -> None:
             f"distances of the cloud to the CAD: {whole.count} points, mean {whole.mean_mm:+.3f}, sigma "
             f"{whole.sigma_mm:.3f}, FWHM {whole.fwhm_mm:.3f} mm"
         )
-    counts = [f"{sum(c.verdict.value == v for c in inspection.components)} {v.replace('_', ' ')}" for v in
-              ("pass", "fail", "undecided", "measured", "not_measured")]  # fmt: skip
+    counts = [
+        f"{sum(c.verdict.value == v for c in inspection.components)} {v.replace('_', ' ')}"
+        for v in ("pass", "fail", "undecided", "measured", "not_measured")
+    ]
     missing = [c.name for c in inspection.components if c.finding is not None]
     if inspection.foreign_objects:
         counts.append(f"{len(inspection.foreign_objects)} foreign")

@@ -68,20 +68,43 @@ reconstruction.json. An interrupted run resumes where it stopped; --force starts
 @click.option("--scale-bar", "bars", multiple=True, metavar="SPEC", help="Known distance of two tags; see below.")
 @click.option("--scale-file", metavar="FILE", help="Boards, tags, scale bars and rig in one TOML file.")
 @click.option("--rig", metavar="FILE", help="Known camera poses in mm.")
-@click.option("--sparse", "poses", metavar="FOLDER|FILE",
-              help="Camera poses made elsewhere: COLMAP model, Metashape XML or transforms.json.")  # fmt: skip
-@click.option("--masks", metavar="FOLDER|auto",
-              help="Masks as IMAGE.png, black where a photo is not to be used; auto: made of the CAD.")  # fmt: skip
+@click.option(
+    "--sparse",
+    "poses",
+    metavar="FOLDER|FILE",
+    help="Camera poses made elsewhere: COLMAP model, Metashape XML or transforms.json.",
+)
+@click.option(
+    "--masks",
+    metavar="FOLDER|auto",
+    help="Masks as IMAGE.png, black where a photo is not to be used; auto: made of the CAD.",
+)
 @click.option("--until", type=click.Choice(STAGES), default="dense", show_default=True, help="Last stage to do.")
-@click.option("--band", type=click.FloatRange(min=0.1), default=5.0, show_default=True, metavar="MM",
-              help="Distance of components from their nominal place that the dense stage covers.")  # fmt: skip
-@click.option("--max-frames", type=click.IntRange(min=3), default=60, show_default=True, metavar="N",
-              help="Frames to take from a video.")  # fmt: skip
+@click.option(
+    "--band",
+    type=click.FloatRange(min=0.1),
+    default=5.0,
+    show_default=True,
+    metavar="MM",
+    help="Distance of components from their nominal place that the dense stage covers.",
+)
+@click.option(
+    "--max-frames",
+    type=click.IntRange(min=3),
+    default=60,
+    show_default=True,
+    metavar="N",
+    help="Frames to take from a video.",
+)
 @click.option("--seed", type=int, default=0, show_default=True, help="The same seed gives the same cloud.")
 @click.option("--threads", type=click.IntRange(min=0), default=0, metavar="N", help="Threads; default: all cores.")
-@click.option("--device", default="auto", show_default=True, metavar="auto|cpu|cuda[:N]",
-              help="Device for features, matching and the dense cloud; auto takes a CUDA GPU if torch (extra gpu) "
-              "finds one.")  # fmt: skip
+@click.option(
+    "--device",
+    default="auto",
+    show_default=True,
+    metavar="auto|cpu|cuda[:N]",
+    help="Device for features, matching and the dense cloud; auto takes a CUDA GPU if torch (extra gpu) finds one.",
+)
 @click.option("--force", is_flag=True, help="Repeat all stages, even those already finished in OUT.")
 @UNIT
 def reconstruct(

@@ -103,7 +103,7 @@ def rework(inspection: str, part_path: str, output: str | None, as_json: bool, u
     """Say what to do about the components of INSPECTION that are out of tolerance."""
     from arview.cad import load_part
     from arview.inspection import load_inspection
-    from arview.rework import drawing_svg, instruction_document, instructions
+    from arview.quality.rework import drawing_svg, instruction_document, instructions
 
     part = load_part(part_path, unit)
     loaded = load_inspection(inspection, part.model)
@@ -167,7 +167,7 @@ def decide(
     job: str, component: str, ok: bool, not_ok: bool, reason: str, photo: str | None, note: str, by: str
 ) -> None:
     """Decide about COMPONENT of JOB."""
-    from arview.decisions import decide_component
+    from arview.quality.decisions import decide_component
 
     if ok == not_ok:
         raise click.UsageError("give either --ok or --not-ok, not both" if ok else "give --ok or --not-ok")
@@ -200,13 +200,13 @@ def sign(job: str, note: str, by: str, store: str | None) -> None:
     """Sign the inspection of JOB as it is now."""
     from contextlib import ExitStack
 
-    from arview.decisions import sign_inspection
-    from arview.decisions.folder import first_inspection, rechecks_of
+    from arview.quality.decisions import sign_inspection
+    from arview.quality.decisions.folder import first_inspection, rechecks_of
 
     with ExitStack() as stack:
         opened = None
         if store is not None:
-            from arview.history import HistoryStore
+            from arview.quality.history import HistoryStore
 
             first_inspection(job)  # an error of the job comes first
             opened = stack.enter_context(HistoryStore(store))  # before a signature that cannot be taken back
@@ -235,10 +235,10 @@ Examples:
 @click.option("-o", "--output", metavar="CSV", help="Write them as CSV.")
 def decisions(job: str, output: str | None) -> None:
     """List the decisions, ticks and signatures of JOB."""
-    from arview.decisions import decisions_csv, log_of
-    from arview.decisions.folder import inspection_path
-    from arview.decisions.table import decision_word
     from arview.inspection import load_inspection
+    from arview.quality.decisions import decisions_csv, log_of
+    from arview.quality.decisions.folder import inspection_path
+    from arview.quality.decisions.table import decision_word
 
     path = inspection_path(job)
     if not path.is_file():
@@ -263,7 +263,7 @@ def decisions(job: str, output: str | None) -> None:
 
 def _told_state(job: str) -> bool:
     """Print what was decided so far, and bring the report up to date; whether the part is released."""
-    from arview.decisions import state_of_record
+    from arview.quality.decisions import state_of_record
 
     state = state_of_record(job)
     for line in (*state.faults, *state.notices):
@@ -277,7 +277,7 @@ def _told_state(job: str) -> bool:
 
 def _not_updated(job: str) -> tuple[Path, ...]:
     """Bring the reports of a record up to date, if there are any; those that could not be are returned."""
-    from arview.decisions.folder import first_inspection
+    from arview.quality.decisions.folder import first_inspection
 
     if not first_inspection(job).with_name("report.html").is_file():
         return ()

@@ -69,9 +69,15 @@ number (ISO/IEC 17043): up to 1, both agree within their U.""",
 @UNIT
 @click.option("--all", "shows_all", is_flag=True, help=f"Print every length, not only the {_SHOWN} worst.")
 def verify(
-    measured: str, known: str, mpe: str | None, output: str | None, plot: str | None, part_path: str | None,
-    unit: str | None, shows_all: bool,
-) -> None:  # fmt: skip
+    measured: str,
+    known: str,
+    mpe: str | None,
+    output: str | None,
+    plot: str | None,
+    part_path: str | None,
+    unit: str | None,
+    shows_all: bool,
+) -> None:
     """Test what was MEASURED against KNOWN lengths: errors, limits, and whether the stated U is confirmed."""
     from arview.acceptance.conformity import parse_limit, record_of
     from arview.acceptance.conformity import verify as run

@@ -28,9 +28,13 @@ def linear_light(gray: NDArray[np.uint8]) -> NDArray[np.float32]:
 
 @kernel
 def find_steps(
-    gray: NDArray[np.float32], pixels: NDArray[np.float64], normals: NDArray[np.float64], reach_px: float,
-    half_width_px: float, threshold: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:  # fmt: skip
+    gray: NDArray[np.float32],
+    pixels: NDArray[np.float64],
+    normals: NDArray[np.float64],
+    reach_px: float,
+    half_width_px: float,
+    threshold: float,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
     """Find the extrema of the slope along the normal of each point.
 
     Args:

@@ -11,54 +11,40 @@ and as a logistic regression with non-negative weights.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from functools import cache
 from typing import NamedTuple
 
 from arview.refinement.evidence import PoseEvidence
 from arview.weights import load_weights
 
-
-@dataclass(frozen=True)
-class ConfidenceOptions:
-    """Limits on the terms of the probability.
-
-    Attributes:
-        min_verifier_score: lower bound on the verifier score, which can reject right poses on unknown materials.
-        max_nearby_margin: upper bound on the margin over other poses at the same place.
-        max_distant_margin: upper bound on the margin over poses at other places.
-        min_view_richness, max_view_richness: bounds on the log ratio of distinct lines in the view to the usual number.
-        small_radius_px: half diameter below which a part counts as small; small parts fit clutter more often.
-        outline_contour, outline_slope: score of the contour verifier at which a well-supported outline counts half,
-            and slope of the logistic function around it.
-        full_inner_share, full_inner_support: share of design edges inside the outline from which they must be seen,
-            too, and support with which they are.
-        min_outline: outline score below which the outline alone confirms no pose.
-        max_cut_loss: log odds that a pose entirely outside the picture would lose. A pose cut by the picture's border
-            loses its share of them unless the outline score reaches ``min_outline`` and the contour verifier confirms
-            what is left, because a part of an outline fits clutter more often than a whole one.
-        cut_contour, cut_slope: score of the contour verifier at which a cut pose counts as half confirmed, and slope
-            of the logistic function around it.
-    """
-
-    min_verifier_score: float = -4.0
-    max_nearby_margin: float = 6.0
-    max_distant_margin: float = 4.0
-    min_view_richness: float = -0.5
-    max_view_richness: float = 0.3
-    small_radius_px: float = 60.0
-    outline_contour: float = -1.0
-    outline_slope: float = 1.5
-    full_inner_share: float = 0.5
-    full_inner_support: float = 0.25
-    min_outline: float = 0.15
-    max_cut_loss: float = 8.0
-    cut_contour: float = -0.1
-    cut_slope: float = 3.0
-
-
-CONFIDENCE = ConfidenceOptions()
-"""The options that the weights were fitted with."""
+MIN_VERIFIER_SCORE = -4.0
+"""Lower bound on the verifier score, which can reject right poses on unknown materials."""
+MAX_NEARBY_MARGIN = 6.0
+"""Upper bound on the margin over other poses at the same place."""
+MAX_DISTANT_MARGIN = 4.0
+"""Upper bound on the margin over poses at other places."""
+MIN_VIEW_RICHNESS = -0.5
+MAX_VIEW_RICHNESS = 0.3
+"""Bounds on the log ratio of distinct lines in the view to the usual number."""
+SMALL_RADIUS_PX = 60.0
+"""Half diameter below which a part counts as small; small parts fit clutter more often."""
+OUTLINE_CONTOUR = -1.0
+OUTLINE_SLOPE = 1.5
+"""Score of the contour verifier at which a well-supported outline counts half, and slope of the logistic function
+around it."""
+FULL_INNER_SHARE = 0.5
+FULL_INNER_SUPPORT = 0.25
+"""Share of design edges inside the outline from which they must be seen, too, and support with which they are."""
+MIN_OUTLINE = 0.15
+"""Outline score below which the outline alone confirms no pose."""
+MAX_CUT_LOSS = 8.0
+"""Log odds that a pose entirely outside the picture would lose. A pose cut by the picture's border loses its share of
+them unless the outline score reaches ``MIN_OUTLINE`` and the contour verifier confirms what is left, because a part of
+an outline fits clutter more often than a whole one."""
+CUT_CONTOUR = -0.1
+CUT_SLOPE = 3.0
+"""Score of the contour verifier at which a cut pose counts as half confirmed, and slope of the logistic function around
+it."""
 
 
 class EvidenceFeatures(NamedTuple):
@@ -98,7 +84,7 @@ class ConfidenceTerms(NamedTuple):
         nearby_margin, distant_margin: bounded margins over competing hypotheses, see `Margins`.
         is_alone: 1 where neither margin is below the bound of the nearby one.
         view_richness: bounded log ratio of distinct lines in the view to the usual number of the part.
-        log_size: logarithm of the half diameter relative to `ConfidenceOptions.small_radius_px`, at most 0.
+        log_size: logarithm of the half diameter relative to `SMALL_RADIUS_PX`, at most 0.
         outline: support, sharpness and colours of the outline as one product, see `outline_score`.
     """
 
@@ -209,15 +195,14 @@ def evidence_logit(evidence: PoseEvidence, view_lines: float, radius_px: float) 
     return weights.evidence_bias + _weighted(weights.evidence, evidence_features(evidence, view_lines, radius_px))
 
 
-def appearance_score(verifier_score: float, edge_response: float, options: ConfidenceOptions = CONFIDENCE) -> float:
+def appearance_score(verifier_score: float, edge_response: float) -> float:
     """What the learned models predict from the image around a pose, as one term of the probability.
 
     Args:
         verifier_score: of the pose verifier.
         edge_response: mean edge response along the part's lines, 0–1.
-        options: its lower bound on the verifier score.
     """
-    bounded = max(verifier_score, options.min_verifier_score)
+    bounded = max(verifier_score, MIN_VERIFIER_SCORE)
     return bounded + confidence_weights().appearance_edge_response * edge_response
 
 
@@ -225,7 +210,6 @@ def outline_score(
     evidence: PoseEvidence,
     outline: PoseEvidence,
     contour: float,
-    options: ConfidenceOptions = CONFIDENCE,
 ) -> float:
     """How clearly the image shows the outline of a pose, 0–1, as one term of the probability.
 
@@ -236,15 +220,13 @@ def outline_score(
         evidence: edge and colour evidence at the pose.
         outline: the same at the scale at which the outline is judged.
         contour: score of the contour verifier; a low one says that the outline is not the part's.
-        options: limits and slopes.
     """
-    o = options
     colours = max(outline.region_support, 0.0) * max(evidence.region_support, 0.0)
     shown = outline.contour_support * outline.sharpness * colours
-    share = min(1.0, evidence.inner_share / o.full_inner_share)
-    inner = 1.0 - share + share * min(1.0, evidence.inner_support / o.full_inner_support)
+    share = min(1.0, evidence.inner_share / FULL_INNER_SHARE)
+    inner = 1.0 - share + share * min(1.0, evidence.inner_support / FULL_INNER_SUPPORT)
     shown *= inner * evidence.points_in_picture
-    return shown / (1.0 + math.exp(-o.outline_slope * (contour - o.outline_contour)))
+    return shown / (1.0 + math.exp(-OUTLINE_SLOPE * (contour - OUTLINE_CONTOUR)))
 
 
 def confidence_terms(
@@ -256,7 +238,6 @@ def confidence_terms(
     margins: Margins,
     relative_lines: float,
     radius_px: float,
-    options: ConfidenceOptions = CONFIDENCE,
 ) -> ConfidenceTerms:
     """Terms of the probability of the best hypothesis of an image.
 
@@ -271,41 +252,35 @@ def confidence_terms(
         relative_lines: distinct lines in the view relative to the geometric mean over the part's views; plain views
             fit clutter by chance more often than others.
         radius_px: half the part's diameter in the image.
-        options: bounds of the terms.
     """
-    o = options
     return ConfidenceTerms(
         appearance=appearance,
         evidence=evidence,
         profile=profile,
         contour=contour,
-        nearby_margin=min(margins.nearby, o.max_nearby_margin),
-        distant_margin=min(margins.distant, o.max_distant_margin),
-        is_alone=float(min(margins.nearby, margins.distant) >= o.max_nearby_margin),
-        view_richness=min(max(math.log(relative_lines), o.min_view_richness), o.max_view_richness),
-        log_size=min(math.log(max(radius_px, 1.0) / o.small_radius_px), 0.0),
+        nearby_margin=min(margins.nearby, MAX_NEARBY_MARGIN),
+        distant_margin=min(margins.distant, MAX_DISTANT_MARGIN),
+        is_alone=float(min(margins.nearby, margins.distant) >= MAX_NEARBY_MARGIN),
+        view_richness=min(max(math.log(relative_lines), MIN_VIEW_RICHNESS), MAX_VIEW_RICHNESS),
+        log_size=min(math.log(max(radius_px, 1.0) / SMALL_RADIUS_PX), 0.0),
         outline=outline,
     )
 
 
-def pose_probability(
-    terms: ConfidenceTerms, options: ConfidenceOptions = CONFIDENCE, share_outside: float = 0.0
-) -> float:
+def pose_probability(terms: ConfidenceTerms, share_outside: float = 0.0) -> float:
     """Probability that the best hypothesis of an image is right: that of the surer of both regressions.
 
     Args:
         terms: of the hypothesis.
-        options: bounds of the terms.
         share_outside: of the outline, cut off by the picture's border.
     """
     weights = confidence_weights()
     total = weights.probability_bias + _weighted(weights.probability, terms)
-    if terms.outline >= options.min_outline:
+    if terms.outline >= MIN_OUTLINE:
         total = max(total, weights.by_outline_bias + _weighted(weights.by_outline, terms))
-    o = options
-    is_confirmed = 1.0 / (1.0 + math.exp(-o.cut_slope * (terms.contour - o.cut_contour)))
-    is_clear = min(max(terms.outline, 0.0) / o.min_outline, 1.0) * is_confirmed
-    total -= o.max_cut_loss * share_outside * (1.0 - is_clear)
+    is_confirmed = 1.0 / (1.0 + math.exp(-CUT_SLOPE * (terms.contour - CUT_CONTOUR)))
+    is_clear = min(max(terms.outline, 0.0) / MIN_OUTLINE, 1.0) * is_confirmed
+    total -= MAX_CUT_LOSS * share_outside * (1.0 - is_clear)
     return 1.0 / (1.0 + math.exp(-min(max(total, -50.0), 50.0)))
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,16 +17,11 @@ from numpy.typing import NDArray
 from arview.camera import Camera
 from arview.camera.undistort import FrameView
 from arview.core.checks import check_type
-from arview.detection.confidence import (
-    ConfidenceOptions,
-    ConfidenceTerms,
-    Margins,
-    confidence_terms,
-    pose_probability,
-)
-from arview.detection.disambiguation import DisambiguationOptions, Disambiguator, is_rotated_by
+from arview.detection.confidence import ConfidenceTerms, Margins, confidence_terms, pose_probability
+from arview.detection.disambiguation import Disambiguator, is_rotated_by
 from arview.detection.features.image_pyramid import ImagePyramid
 from arview.detection.search.global_search import (
+    CUT_FILL,
     GRADIENTS_ONLY,
     QUICK,
     QUICK_OUTER,
@@ -40,30 +35,28 @@ from arview.detection.search.global_search import (
     search_distances_mm,
 )
 from arview.detection.search.hypothesis import Hypothesis
-from arview.detection.search.local_search import LocalSearch, LocalSearchOptions
-from arview.detection.symmetry import SymmetryOptions, find_rotational_symmetries
+from arview.detection.search.local_search import DISTINCT_DEG, LocalSearch, LocalSearchOptions
+from arview.detection.symmetry import find_rotational_symmetries
 from arview.errors import InputError
 from arview.geometry import Array
 from arview.guideviews import GuideViewSet
 from arview.guideviews.sphere import icosphere_directions
 from arview.refinement.evidence import PoseEvidence
 
+SAME_ASIDE = 0.12
+SAME_ALONG = 0.15
+SAME_DEG = 20.0
+"""Offset across the line of sight in diameters, offset along it as a share of the distance, and rotation within which
+two hypotheses are one, badly refined."""
+NEARBY_ASIDE = 0.35
+NEARBY_ALONG = 0.25
+"""Offsets within which competing hypotheses are at the same place."""
 
-@dataclass(frozen=True)
-class MarginOptions:
-    """When two hypotheses compete, and whether they are at one place.
 
-    Attributes:
-        same_aside, same_along, same_deg: offset across the line of sight in diameters, offset along it as a share of
-            the distance, and rotation within which two hypotheses are one, badly refined.
-        nearby_aside, nearby_along: offsets within which competing hypotheses are at the same place.
-    """
-
-    same_aside: float = 0.12
-    same_along: float = 0.15
-    same_deg: float = 20.0
-    nearby_aside: float = 0.35
-    nearby_along: float = 0.25
+GLOBAL_SEARCH = GlobalSearchOptions()
+"""Of the search for rough poses; its radius, roll step and subdivisions are those above."""
+LOCAL = LocalSearchOptions()
+"""Of the search around rough poses; its radius is that above."""
 
 
 @dataclass(frozen=True)
@@ -78,12 +71,6 @@ class DetectorOptions:
         min_quality: probability below which a result is no detection.
         min_quick_quality: probability above which a search ends without a wider one; margins over few competitors
             overstate it.
-        global_search: of the search for rough poses; its radius, roll step and subdivisions are those above.
-        local: of the search around rough poses; its radius is that above.
-        symmetry: of the search for symmetries of the part.
-        disambiguation: of near-symmetric poses.
-        margins: of the margins over competing hypotheses.
-        confidence: limits on the terms of the probability.
 
     Raises:
         InputError: ``radius_px`` is out of range.
@@ -95,12 +82,6 @@ class DetectorOptions:
     budgets: tuple[SearchBudget, ...] = (QUICK, QUICK_OUTER, WIDE, WIDE_OUTER, GRADIENTS_ONLY, UNTRIMMED)
     min_quality: float = 0.5
     min_quick_quality: float = 0.6
-    global_search: GlobalSearchOptions = field(default_factory=GlobalSearchOptions)
-    local: LocalSearchOptions = field(default_factory=LocalSearchOptions)
-    symmetry: SymmetryOptions = field(default_factory=SymmetryOptions)
-    disambiguation: DisambiguationOptions = field(default_factory=DisambiguationOptions)
-    margins: MarginOptions = field(default_factory=MarginOptions)
-    confidence: ConfidenceOptions = field(default_factory=ConfidenceOptions)
 
     def __post_init__(self) -> None:
         if not 10 <= self.radius_px <= 60:
@@ -157,7 +138,7 @@ class RejectedHypothesis:
 def local_search_for(views: GuideViewSet, camera: Camera, options: DetectorOptions | None = None) -> LocalSearch:
     """The local search that a detector with these options uses."""
     o = options or options_for(views)
-    return LocalSearch(views, camera, replace(o.local, radius_px=o.radius_px), search_distances_mm(views, camera))
+    return LocalSearch(views, camera, replace(LOCAL, radius_px=o.radius_px), search_distances_mm(views, camera))
 
 
 class Detector:
@@ -194,10 +175,10 @@ class Detector:
         self.camera = camera = self.frames.tracked_camera
         self.best_rejected: RejectedHypothesis | None = None
         self.local = local or local_search_for(views, camera, o)
-        self.symmetries = find_rotational_symmetries(views, o.symmetry)
-        self.disambiguator = Disambiguator(self.local, self.symmetries, o.disambiguation)
+        self.symmetries = find_rotational_symmetries(views)
+        self.disambiguator = Disambiguator(self.local, self.symmetries)
         searched = replace(
-            o.global_search, radius_px=o.radius_px, roll_step_deg=o.roll_step_deg, subdivisions=o.subdivisions
+            GLOBAL_SEARCH, radius_px=o.radius_px, roll_step_deg=o.roll_step_deg, subdivisions=o.subdivisions
         )
         self.global_search = GlobalSearch(
             views, self.local.refiner.part, self.local.reduced_camera, searched, self.symmetries.exact
@@ -267,11 +248,11 @@ class Detector:
         for budget in (o.budgets[k] for k in searches):
             starts = local.pattern_search(pyramid, self.global_search.starts(pyramid, budget), budget.kept)
             found = local.refine_and_verify(pyramid, starts)
-            hypotheses = local.deduplicate([*hypotheses, *found], local.options.distinct_deg)
+            hypotheses = local.deduplicate([*hypotheses, *found], DISTINCT_DEG)
             if hypotheses and self.qualities(hypotheses)[0] < min_quality:
                 # The search may have found a near-symmetric pose of the right one, which fits worse.
                 counterparts = self.disambiguator.counterparts(pyramid, hypotheses[0])
-                hypotheses = local.deduplicate([*hypotheses, *counterparts], local.options.distinct_deg)
+                hypotheses = local.deduplicate([*hypotheses, *counterparts], DISTINCT_DEG)
             if hypotheses and self.qualities(hypotheses)[0] >= min_quality:
                 break
         return hypotheses
@@ -279,7 +260,7 @@ class Detector:
     def qualities(self, hypotheses: list[Hypothesis]) -> list[float]:
         """Probability that each of several hypotheses, best first, is right; see `pose_probability`."""
         return [
-            pose_probability(self.terms(h, hypotheses[k + 1 :]), self.options.confidence, self._share_cut_off(h))
+            pose_probability(self.terms(h, hypotheses[k + 1 :]), self._share_cut_off(h))
             for k, h in enumerate(hypotheses)
         ]
 
@@ -288,7 +269,7 @@ class Detector:
         camera = self.local.reduced_camera
         distance_mm = float(np.linalg.norm(hypothesis.cam_from_body[:3, 3]))
         span_px = 0.5 * (camera.fx + camera.fy) * self.views.diameter_mm / distance_mm
-        is_large = span_px >= self.options.global_search.cut_fill * min(camera.width, camera.height)
+        is_large = span_px >= CUT_FILL * min(camera.width, camera.height)
         return 1.0 - hypothesis.evidence.points_in_picture if is_large else 0.0
 
     def terms(self, best: Hypothesis, others: list[Hypothesis]) -> ConfidenceTerms:
@@ -302,12 +283,10 @@ class Detector:
             margins=self.margins(best, others),
             relative_lines=best.view_lines / self.local.mean_view_lines,
             radius_px=best.radius_px,
-            options=self.options.confidence,
         )
 
     def margins(self, best: Hypothesis, others: list[Hypothesis]) -> Margins:
         """Margins of a hypothesis over competing ones; copies of it that are badly refined do not compete."""
-        o = self.options.margins
         nearby = distant = -math.inf
         place = best.cam_from_body[:3, 3]
         distance_mm = float(np.linalg.norm(place))
@@ -315,10 +294,10 @@ class Detector:
             offset = other.cam_from_body[:3, 3] - place
             along_mm = abs(float(offset @ place)) / distance_mm
             aside = math.sqrt(max(float(offset @ offset) - along_mm**2, 0.0)) / self.views.diameter_mm
-            is_similar = is_rotated_by(best, other, self.disambiguator.all_rotations, o.same_deg)
-            if aside < o.same_aside and along_mm < o.same_along * distance_mm and is_similar:
+            is_similar = is_rotated_by(best, other, self.disambiguator.all_rotations, SAME_DEG)
+            if aside < SAME_ASIDE and along_mm < SAME_ALONG * distance_mm and is_similar:
                 continue
-            if aside < o.nearby_aside and along_mm < o.nearby_along * distance_mm:
+            if aside < NEARBY_ASIDE and along_mm < NEARBY_ALONG * distance_mm:
                 nearby = max(nearby, other.logit)
             else:
                 distant = max(distant, other.logit)

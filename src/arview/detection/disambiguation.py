@@ -6,7 +6,6 @@ pair comparator, by the edges that only one of both poses has, and by their log 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from itertools import combinations
 
 import numpy as np
@@ -15,37 +14,26 @@ from arview.core.parallel import pool
 from arview.detection.features.image_pyramid import ImagePyramid
 from arview.detection.scoring.pair_comparator import PairComparator
 from arview.detection.search.hypothesis import Hypothesis
-from arview.detection.search.local_search import LocalSearch
-from arview.detection.symmetry import EdgeMarginOptions, RotationalSymmetries, edge_margin, rotations_about
+from arview.detection.search.local_search import DISTINCT_DEG, LocalSearch
+from arview.detection.symmetry import RotationalSymmetries, edge_margin, rotations_about
 from arview.geometry import Array, turned
 
-
-@dataclass(frozen=True)
-class DisambiguationOptions:
-    """Options of the disambiguation.
-
-    Attributes:
-        place_share: distance in diameters within which hypotheses are at the same place.
-        same_deg: rotation within which two hypotheses are one, badly refined.
-        max_hypotheses: best hypotheses that are compared.
-        min_lead: lead in log odds above which the best hypothesis is right without a comparison.
-        min_margin: margin of evidence above which a hypothesis is right rather than another; below it, the other is an
-            alternative.
-        logit_weight: weight of the difference in log odds beside the pair comparator and the edges.
-        edges: see `EdgeMarginOptions`.
-        sweep_step_deg: step of the rotation sweep about the axes of nearly round parts.
-        max_sweep_starts: best angles of the sweep that are refined.
-    """
-
-    place_share: float = 0.25
-    same_deg: float = 20.0
-    max_hypotheses: int = 12
-    min_lead: float = 3.4
-    min_margin: float = 2.0
-    logit_weight: float = 0.2
-    edges: EdgeMarginOptions = field(default_factory=EdgeMarginOptions)
-    sweep_step_deg: int = 5
-    max_sweep_starts: int = 6
+PLACE_SHARE = 0.25
+"""Distance in diameters within which hypotheses are at the same place."""
+SAME_DEG = 20.0
+"""Rotation within which two hypotheses are one, badly refined."""
+MAX_HYPOTHESES = 12
+"""Best hypotheses that are compared."""
+MIN_LEAD = 3.4
+"""Lead in log odds above which the best hypothesis is right without a comparison."""
+MIN_MARGIN = 2.0
+"""Margin of evidence above which a hypothesis is right rather than another; below it, the other is an alternative."""
+LOGIT_WEIGHT = 0.2
+"""Weight of the difference in log odds beside the pair comparator and the edges."""
+SWEEP_STEP_DEG = 5
+"""Step of the rotation sweep about the axes of nearly round parts."""
+MAX_SWEEP_STARTS = 6
+"""Best angles of the sweep that are refined."""
 
 
 def is_rotated_by(a: Hypothesis, b: Hypothesis, rotations: Array, angle_deg: float) -> bool:
@@ -60,11 +48,9 @@ class Disambiguator:
     Args:
         local: local search of the part.
         symmetries: of the part.
-        options: see `DisambiguationOptions`.
     """
 
-    def __init__(self, local: LocalSearch, symmetries: RotationalSymmetries, options: DisambiguationOptions) -> None:
-        self.options = options
+    def __init__(self, local: LocalSearch, symmetries: RotationalSymmetries) -> None:
         self.symmetries = symmetries
         self.exact_rotations = np.concatenate([np.eye(3)[None], symmetries.exact])
         self.all_rotations = np.concatenate([self.exact_rotations, symmetries.near])
@@ -84,7 +70,6 @@ class Disambiguator:
             best: verified hypothesis.
             others: verified hypotheses of the same image.
         """
-        o = self.options
         hypotheses = self._near_symmetric(pyramid, best, others)
         if len(hypotheses) == 1:
             return hypotheses[0], []
@@ -92,8 +77,8 @@ class Disambiguator:
         # The leader has the largest margin over its strongest competitor.
         leader = int(np.argmax((margins + np.diag(np.full(len(hypotheses), np.inf))).min(axis=1)))
         best = hypotheses[leader]
-        close = [h for k, h in enumerate(hypotheses) if k != leader and margins[leader, k] < o.min_margin]
-        others = [h for h in close if not is_rotated_by(h, best, self.exact_rotations, o.same_deg)]
+        close = [h for k, h in enumerate(hypotheses) if k != leader and margins[leader, k] < MIN_MARGIN]
+        others = [h for h in close if not is_rotated_by(h, best, self.exact_rotations, SAME_DEG)]
         return best, [*others, *self._close_counterparts(pyramid, best, others)]
 
     def _close_counterparts(self, pyramid: ImagePyramid, best: Hypothesis, known: list[Hypothesis]) -> list[Hypothesis]:
@@ -106,10 +91,10 @@ class Disambiguator:
         counterparts = [
             other
             for other in local.verify(pyramid, evaluated)
-            if not any(is_rotated_by(other, h, self.exact_rotations, self.options.same_deg) for h in known)
+            if not any(is_rotated_by(other, h, self.exact_rotations, SAME_DEG) for h in known)
         ]
         margins = self.evidence_margins(pyramid, [best, *counterparts])[0, 1:]
-        return [other for other, margin in zip(counterparts, margins, strict=True) if margin < self.options.min_margin]
+        return [other for other, margin in zip(counterparts, margins, strict=True) if margin < MIN_MARGIN]
 
     def counterparts(self, pyramid: ImagePyramid, hypothesis: Hypothesis) -> list[Hypothesis]:
         """The near-symmetric poses of a hypothesis, refined and verified."""
@@ -118,26 +103,25 @@ class Disambiguator:
 
     def _near_symmetric(self, pyramid: ImagePyramid, best: Hypothesis, others: list[Hypothesis]) -> list[Hypothesis]:
         """The best hypothesis at a place, and those near-symmetric to it that are not clearly worse."""
-        o, local = self.options, self._local
+        local = self._local
         pose = best.cam_from_body
         starts = turned(pose, self.symmetries.near) + self.rotation_sweep(pyramid, pose)
-        reach_mm = o.place_share * local.views.diameter_mm
+        reach_mm = PLACE_SHARE * local.views.diameter_mm
         nearby = [h for h in others if np.linalg.norm(h.cam_from_body[:3, 3] - pose[:3, 3]) < reach_mm]
-        distinct_deg = local.options.distinct_deg
+        distinct_deg = DISTINCT_DEG
         hypotheses = local.deduplicate(
             [best, *local.verify(pyramid, local.refine_fine(pyramid, starts)), *nearby], distinct_deg
         )
         first = hypotheses[0]
-        likely = [h for h in hypotheses[1:] if h.logit_without_contour > first.logit_without_contour - o.min_lead]
+        likely = [h for h in hypotheses[1:] if h.logit_without_contour > first.logit_without_contour - MIN_LEAD]
         similar = [h for h in likely if self._is_near_symmetric(h, first) or self._shares_axis(h, first)]
-        return [first, *similar][: o.max_hypotheses]
+        return [first, *similar][:MAX_HYPOTHESES]
 
     def rotation_sweep(self, pyramid: ImagePyramid, pose: Array) -> list[Array]:
         """A pose (4,4) rotated about each axis of a nearly round part to the angles at which its edges are supported.
 
         The outline of such a part fits at any angle; the few small edges that break the symmetry do not guide a search.
         """
-        o = self.options
         picture = self._local.work_picture(pyramid, pose)
         refiner = self._local.refiner.with_camera(picture.camera)
 
@@ -147,10 +131,10 @@ class Disambiguator:
 
         starts = []
         for axis in self.symmetries.axes:
-            poses = turned(pose, rotations_about(axis, range(0, 360, o.sweep_step_deg)))
+            poses = turned(pose, rotations_about(axis, range(0, 360, SWEEP_STEP_DEG)))
             support = np.array(list(pool().map(mean_support, poses)))
             peaks = np.flatnonzero((support >= np.roll(support, 1)) & (support > np.roll(support, -1)))
-            starts += [poses[k] for k in peaks[np.argsort(-support[peaks], kind="stable")][: o.max_sweep_starts]]
+            starts += [poses[k] for k in peaks[np.argsort(-support[peaks], kind="stable")][:MAX_SWEEP_STARTS]]
         return starts
 
     def evidence_margins(self, pyramid: ImagePyramid, hypotheses: list[Hypothesis]) -> Array:
@@ -159,17 +143,17 @@ class Disambiguator:
         refiner = self._local.refiner.with_camera(picture.camera)
         logits = np.array([h.logit_without_contour for h in hypotheses])
         margins = self._pair_comparator.log_odds(pyramid, [h.cam_from_body for h in hypotheses])
-        margins += self.options.logit_weight * (logits[:, None] - logits)
+        margins += LOGIT_WEIGHT * (logits[:, None] - logits)
         steps = list(pool().map(lambda h: refiner.edge_steps(picture.gray, h.cam_from_body), hypotheses))
         for a, b in combinations(range(len(hypotheses)), 2):
-            by_edges = edge_margin(steps[a], steps[b], self.options.edges)
+            by_edges = edge_margin(steps[a], steps[b])
             margins[a, b] += by_edges
             margins[b, a] -= by_edges
         return margins
 
     def _is_near_symmetric(self, a: Hypothesis, b: Hypothesis) -> bool:
         """Whether a near symmetry maps one pose to the other, and no exact one does."""
-        same_deg = self.options.same_deg
+        same_deg = SAME_DEG
         is_same = is_rotated_by(a, b, self.exact_rotations, same_deg)
         return not is_same and is_rotated_by(a, b, self.all_rotations, same_deg)
 
@@ -177,4 +161,4 @@ class Disambiguator:
         """Whether two poses differ by a rotation about an axis about which the part is nearly round."""
         axes = self.symmetries.axes
         cosines = np.sum((axes @ a.cam_from_body[:3, :3].T) * (axes @ b.cam_from_body[:3, :3].T), axis=1)
-        return bool(np.any(cosines > np.cos(np.deg2rad(self.options.same_deg))))
+        return bool(np.any(cosines > np.cos(np.deg2rad(SAME_DEG))))

@@ -7,8 +7,6 @@ hand does not count.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -16,25 +14,17 @@ from numpy.typing import NDArray
 from arview.camera import Camera
 from arview.guideviews import GuideViewSet
 
-
-@dataclass(frozen=True)
-class SceneChangeOptions:
-    """What counts as a change.
-
-    Attributes:
-        width_px: width of the reduced pictures that are compared.
-        min_difference: difference in grey levels of one channel from which a pixel has changed.
-        min_part_share: changed area from which the scene has changed, as a share of the square of the part's diameter
-            in the picture at its farthest distance; the part itself covers up to half of that square.
-        max_share: the same as a share of the picture, for parts that are large at all distances.
-        max_gain: largest factor by which exposure or white balance may have changed.
-    """
-
-    width_px: int = 64
-    min_difference: int = 10
-    min_part_share: float = 0.2
-    max_share: float = 0.05
-    max_gain: float = 2.0
+WIDTH_PX = 64
+"""Width of the reduced pictures that are compared."""
+MIN_DIFFERENCE = 10
+"""Difference in grey levels of one channel from which a pixel has changed."""
+MIN_PART_SHARE = 0.2
+"""Changed area from which the scene has changed, as a share of the square of the part's diameter in the picture at its
+farthest distance; the part itself covers up to half of that square."""
+MAX_SHARE = 0.05
+"""The same as a share of the picture, for parts that are large at all distances."""
+MAX_GAIN = 2.0
+"""Largest factor by which exposure or white balance may have changed."""
 
 
 class SceneChange:
@@ -43,16 +33,14 @@ class SceneChange:
     Args:
         views: guide views of the part, whose range says how small it may be in the picture.
         camera: of the pictures.
-        options: see `SceneChangeOptions`.
     """
 
-    def __init__(self, views: GuideViewSet, camera: Camera, options: SceneChangeOptions | None = None) -> None:
-        self.options = o = options or SceneChangeOptions()
+    def __init__(self, views: GuideViewSet, camera: Camera) -> None:
         farthest_mm = views.view_range.for_camera(camera, views.diameter_mm).distance_mm[1]
         diameter_px = 0.5 * (camera.fx + camera.fy) * views.diameter_mm / farthest_mm
-        share = o.min_part_share * diameter_px**2 / (camera.width * camera.height)
-        self._min_share = min(share, o.max_share)
-        self._size = (o.width_px, max(1, round(o.width_px * camera.height / camera.width)))
+        share = MIN_PART_SHARE * diameter_px**2 / (camera.width * camera.height)
+        self._min_share = min(share, MAX_SHARE)
+        self._size = (WIDTH_PX, max(1, round(WIDTH_PX * camera.height / camera.width)))
 
     def reduced(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """A frame (H,W,3) uint8 RGB at the size at which pictures are compared."""
@@ -64,9 +52,9 @@ class SceneChange:
 
     def changed_share(self, before: NDArray[np.uint8], after: NDArray[np.uint8]) -> float:
         """Share 0–1 of the pixels that changed between two reduced pictures."""
-        o, around = self.options, np.ones((3, 3), dtype=np.uint8)
-        gains = np.median((after + 1.0) / (before + 1.0), axis=(0, 1)).clip(1.0 / o.max_gain, o.max_gain)
+        around = np.ones((3, 3), dtype=np.uint8)
+        gains = np.median((after + 1.0) / (before + 1.0), axis=(0, 1)).clip(1.0 / MAX_GAIN, MAX_GAIN)
         before = np.round(before * gains).clip(0, 255).astype(np.uint8)
         lighter = cv2.subtract(after, cv2.dilate(before, around))
         darker = cv2.subtract(cv2.erode(before, around), after)
-        return float(np.mean(np.maximum(lighter, darker).max(axis=2) >= o.min_difference))
+        return float(np.mean(np.maximum(lighter, darker).max(axis=2) >= MIN_DIFFERENCE))

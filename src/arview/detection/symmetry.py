@@ -24,51 +24,36 @@ USUAL_ANGLES_DEG, FIFTHS_DEG = sorted({*range(30, 360, 30), *range(45, 360, 45)}
 """Angles that are tried about the model's axes."""
 
 
-@dataclass(frozen=True)
-class SymmetryOptions:
-    """Options of `find_rotational_symmetries`.
-
-    Attributes:
-        near_distance, exact_distance: distance in diameters within which rotated edges match others in a near and in an
-            exact symmetry.
-        near_share, exact_share: share of the edges that a near and an exact symmetry match.
-        max_views, max_points: numbers of guide views and edge points that are tested.
-        cell: size in diameters of the cells of which one edge point is kept.
-        min_sharp_share: share of design edges from which they alone are tested; organic shapes have only silhouettes.
-        min_axis_rotations: symmetries about one axis, near ones among them, from which a part is nearly round.
-    """
-
-    near_distance: float = 0.025
-    exact_distance: float = 0.012
-    near_share: float = 0.9
-    exact_share: float = 0.997
-    max_views: int = 60
-    max_points: int = 6000
-    cell: float = 0.006
-    min_sharp_share: float = 0.2
-    min_axis_rotations: int = 3
+NEAR_DISTANCE = 0.025
+EXACT_DISTANCE = 0.012
+"""Distance in diameters within which rotated edges match others in a near and in an exact symmetry."""
+NEAR_SHARE = 0.9
+EXACT_SHARE = 0.997
+"""Share of the edges that a near and an exact symmetry match."""
+MAX_VIEWS = 60
+MAX_POINTS = 6000
+"""Numbers of guide views and edge points that are tested."""
+CELL = 0.006
+"""Size in diameters of the cells of which one edge point is kept."""
+MIN_SHARP_SHARE = 0.2
+"""Share of design edges from which they alone are tested; organic shapes have only silhouettes."""
+MIN_AXIS_ROTATIONS = 3
+"""Symmetries about one axis, near ones among them, from which a part is nearly round."""
 
 
-@dataclass(frozen=True)
-class EdgeMarginOptions:
-    """Options of `edge_margin`.
-
-    Attributes:
-        shared_px, shared_cosine: distance and parallelism within which an edge of one pose lies on one of the other.
-        spacing_px: largest distance between the points of two edges that are compared.
-        neighbours: nearest points that are compared.
-        correlated_points: neighbouring points whose support is correlated.
-        min_points: number of points below which nothing is concluded.
-        support_deviation: standard deviation of the support of a point.
-    """
-
-    shared_px: float = 3.0
-    shared_cosine: float = 0.8
-    spacing_px: float = 12.0
-    neighbours: int = 12
-    correlated_points: float = 4.0
-    min_points: int = 4
-    support_deviation: float = 0.5
+SHARED_PX = 3.0
+SHARED_COSINE = 0.8
+"""Distance and parallelism within which an edge of one pose lies on one of the other."""
+SPACING_PX = 12.0
+"""Largest distance between the points of two edges that are compared."""
+NEIGHBOURS = 12
+"""Nearest points that are compared."""
+CORRELATED_POINTS = 4.0
+"""Neighbouring points whose support is correlated."""
+MIN_POINTS = 4
+"""Number of points below which nothing is concluded."""
+SUPPORT_DEVIATION = 0.5
+"""Standard deviation of the support of a point."""
 
 
 @dataclass(frozen=True)
@@ -86,19 +71,18 @@ class RotationalSymmetries:
     axes: Array
 
 
-def find_rotational_symmetries(views: GuideViewSet, options: SymmetryOptions | None = None) -> RotationalSymmetries:
+def find_rotational_symmetries(views: GuideViewSet) -> RotationalSymmetries:
     """Rotations of a part onto itself, found on the edges of its guide views."""
-    o = options or SymmetryOptions()
-    points = _edge_points(views, o)
+    points = _edge_points(views)
     tree = cKDTree(points)
 
     def among(rotations: Array) -> RotationalSymmetries:
         exact, near = [], []
         for rotation in rotations:
-            distance, _ = tree.query(points[::4] @ rotation.T, distance_upper_bound=o.near_distance * views.diameter_mm)
-            if np.mean(distance < o.exact_distance * views.diameter_mm) >= o.exact_share:
+            distance, _ = tree.query(points[::4] @ rotation.T, distance_upper_bound=NEAR_DISTANCE * views.diameter_mm)
+            if np.mean(distance < EXACT_DISTANCE * views.diameter_mm) >= EXACT_SHARE:
                 exact.append(rotation)
-            elif np.mean(np.isfinite(distance)) >= o.near_share:
+            elif np.mean(np.isfinite(distance)) >= NEAR_SHARE:
                 near.append(rotation)
         return RotationalSymmetries(
             np.array(exact).reshape(-1, 3, 3), np.array(near).reshape(-1, 3, 3), np.empty((0, 3))
@@ -108,7 +92,7 @@ def find_rotational_symmetries(views: GuideViewSet, options: SymmetryOptions | N
         # A rotation by a fifth is close to one by five twelfths, so that only one of both sets is used.
         usual, fifths = (among(rotations_about(axis, angles_deg)) for angles_deg in (USUAL_ANGLES_DEG, FIFTHS_DEG))
         found = max(usual, fifths, key=lambda found: len(found.exact) + len(found.near))
-        is_round = len(found.near) > 0 and len(found.exact) + len(found.near) >= o.min_axis_rotations
+        is_round = len(found.near) > 0 and len(found.exact) + len(found.near) >= MIN_AXIS_ROTATIONS
         return replace(found, axes=axis[None]) if is_round else found
 
     groups = [*map(about, np.eye(3)), among(_diagonal_rotations())]
@@ -118,17 +102,17 @@ def find_rotational_symmetries(views: GuideViewSet, options: SymmetryOptions | N
     return RotationalSymmetries(exact, near, axes)
 
 
-def _edge_points(views: GuideViewSet, options: SymmetryOptions) -> Array:
+def _edge_points(views: GuideViewSet) -> Array:
     """Points (N,3) of the edges seen from all around, about the centre of the part."""
-    step = max(1, len(views) // options.max_views)
+    step = max(1, len(views) // MAX_VIEWS)
     features_of = [views.view(i).features for i in range(0, len(views), step)]
     points = np.concatenate([features.edge_points for features in features_of])
     sharp = np.concatenate([features.edge_kinds for features in features_of]) & EDGE_SHARP > 0
-    points = (points[sharp] if np.mean(sharp) > options.min_sharp_share else points) - views.center_in_model
+    points = (points[sharp] if np.mean(sharp) > MIN_SHARP_SHARE else points) - views.center_in_model
     # One point per cell, so that edges seen in many views count once.
-    cells = np.round(points / (options.cell * views.diameter_mm)).astype(np.int64)
+    cells = np.round(points / (CELL * views.diameter_mm)).astype(np.int64)
     _, first = np.unique(cells, axis=0, return_index=True)
-    chosen: NDArray[np.intp] = np.sort(first)[:: max(1, len(first) // options.max_points)]
+    chosen: NDArray[np.intp] = np.sort(first)[:: max(1, len(first) // MAX_POINTS)]
     return np.asarray(points[chosen])
 
 
@@ -151,32 +135,30 @@ def _diagonal_rotations() -> Array:
     return np.concatenate(turns)
 
 
-def edge_margin(a: EdgeSteps, b: EdgeSteps, options: EdgeMarginOptions | None = None) -> float:
+def edge_margin(a: EdgeSteps, b: EdgeSteps) -> float:
     """Difference of support, in standard deviations, between the edges that only pose a has and those that only b has.
 
     Near-symmetric poses share most edges, and comparing all of them drowns the few that differ in noise. An edge that
     exists is supported like the shared ones, one that does not is supported by chance only; half of the shared support
     separates both.
     """
-    o = options or EdgeMarginOptions()
-    is_own_a, is_own_b = _is_own(a, b, o), _is_own(b, a, o)
+    is_own_a, is_own_b = _is_own(a, b), _is_own(b, a)
     own_a, own_b = a.support[is_own_a], b.support[is_own_b]
     count = len(own_a) + len(own_b)
-    if count < o.min_points:
+    if count < MIN_POINTS:
         return 0.0
     shared = np.concatenate([a.support[~is_own_a], b.support[~is_own_b]])
     middle = 0.5 * (shared.mean() if len(shared) else 1.0)
     lead = np.sum(own_a - middle) - np.sum(own_b - middle)
-    return float(lead / (o.support_deviation * np.sqrt(count * o.correlated_points)))
+    return float(lead / (SUPPORT_DEVIATION * np.sqrt(count * CORRELATED_POINTS)))
 
 
-def _is_own(a: EdgeSteps, b: EdgeSteps, options: EdgeMarginOptions) -> NDArray[np.bool_]:
+def _is_own(a: EdgeSteps, b: EdgeSteps) -> NDArray[np.bool_]:
     """Which edges of a lie on no parallel edge of b."""
-    o = options
-    near, index = cKDTree(b.pixels).query(a.pixels, k=o.neighbours, distance_upper_bound=o.spacing_px)
+    near, index = cKDTree(b.pixels).query(a.pixels, k=NEIGHBOURS, distance_upper_bound=SPACING_PX)
     index = np.minimum(index, len(b.pixels) - 1)
     # The distance is measured across the edge, because the points along it are apart.
     across_px = np.abs(np.einsum("nj,nkj->nk", a.normals, b.pixels[index] - a.pixels[:, None]))
-    is_parallel = np.abs(np.einsum("nj,nkj->nk", a.normals, b.normals[index])) > o.shared_cosine
-    is_shared = np.isfinite(near) & (across_px < o.shared_px) & is_parallel
+    is_parallel = np.abs(np.einsum("nj,nkj->nk", a.normals, b.normals[index])) > SHARED_COSINE
+    is_shared = np.isfinite(near) & (across_px < SHARED_PX) & is_parallel
     return np.asarray(~np.any(is_shared, axis=1))

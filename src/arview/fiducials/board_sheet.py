@@ -19,9 +19,14 @@ from arview.fiducials.board import Board, cv_board, spec_of
 from arview.geometry import Array
 
 PAPERS_MM = {
-    "A4": (297.0, 210.0), "A3": (420.0, 297.0), "A2": (594.0, 420.0), "A1": (841.0, 594.0), "A0": (1189.0, 841.0),
-    "letter": (279.4, 215.9), "tabloid": (431.8, 279.4),
-}  # fmt: skip
+    "A4": (297.0, 210.0),
+    "A3": (420.0, 297.0),
+    "A2": (594.0, 420.0),
+    "A1": (841.0, 594.0),
+    "A0": (1189.0, 841.0),
+    "letter": (279.4, 215.9),
+    "tabloid": (431.8, 279.4),
+}
 """Width and height of sheets in landscape format."""
 DICTIONARY = "DICT_5X5_100"
 """Default marker dictionary of printed boards."""
@@ -127,13 +132,17 @@ def rectangles_mm(board: Board) -> tuple[Array, Array]:
     drawn = cv_board(board)
     cell, side = board.cell_mm, board.marker_mm
     bits = int(drawn.getDictionary().markerSize) + 2  # with its black border
-    markers = [(int(i), np.asarray(c, dtype=np.float64)[0, :2]) for i, c in
-               zip(drawn.getIds().ravel(), drawn.getObjPoints(), strict=True)]  # fmt: skip
+    markers = [
+        (int(i), np.asarray(c, dtype=np.float64)[0, :2])
+        for i, c in zip(drawn.getIds().ravel(), drawn.getObjPoints(), strict=True)
+    ]
     white_squares = {(int(corner[0] // cell), int(corner[1] // cell)) for _, corner in markers}
     black = [
         (column * cell, row * cell, cell, cell)
-        for row in range(board.rows) for column in range(board.columns) if (column, row) not in white_squares
-    ]  # fmt: skip
+        for row in range(board.rows)
+        for column in range(board.columns)
+        if (column, row) not in white_squares
+    ]
     white = []
     for index, corner in markers:
         # OpenCV's corners are float32, so the exact position is computed from the square.
@@ -168,15 +177,24 @@ def board_pdf(sheet: Sheet) -> bytes:
     _draw_rulers(stream, sheet)
     pdf = pydyf.PDF()
     pdf.add_object(stream)
-    font = pydyf.Dictionary({
-        "Type": "/Font", "Subtype": "/Type1", "BaseFont": "/Helvetica", "Encoding": "/WinAnsiEncoding",
-    })  # fmt: skip
+    font = pydyf.Dictionary(
+        {
+            "Type": "/Font",
+            "Subtype": "/Type1",
+            "BaseFont": "/Helvetica",
+            "Encoding": "/WinAnsiEncoding",
+        }
+    )
     pdf.add_object(font)
-    page = pydyf.Dictionary({
-        "Type": "/Page", "Parent": pdf.pages.reference, "Contents": stream.reference,
-        "MediaBox": pydyf.Array([0, 0, _short(sheet.width_mm * _PT_PER_MM), _short(sheet.height_mm * _PT_PER_MM)]),
-        "Resources": pydyf.Dictionary({"Font": pydyf.Dictionary({"F1": font.reference})}),
-    })  # fmt: skip
+    page = pydyf.Dictionary(
+        {
+            "Type": "/Page",
+            "Parent": pdf.pages.reference,
+            "Contents": stream.reference,
+            "MediaBox": pydyf.Array([0, 0, _short(sheet.width_mm * _PT_PER_MM), _short(sheet.height_mm * _PT_PER_MM)]),
+            "Resources": pydyf.Dictionary({"Font": pydyf.Dictionary({"F1": font.reference})}),
+        }
+    )
     pdf.add_page(page)
     pdf.catalog["ViewerPreferences"] = pydyf.Dictionary({"PrintScaling": "/None"})
     pdf.info["Title"] = pydyf.String(f"ChArUco board {spec_of(sheet.board)}")

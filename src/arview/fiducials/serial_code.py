@@ -89,25 +89,18 @@ class SerialNumbers:
         return tuple(name for name in TAG_FAMILIES if name in self.serial or name in self.pattern)
 
 
-@dataclass(frozen=True)
-class SerialCodeOptions:
-    """When and how serial codes are read.
-
-    Attributes:
-        every: frames between two attempts until a code has been read.
-        again_every: frames between two attempts afterwards.
-        max_side_px: longer side of the cut-out of the part beyond which it is reduced; it bounds the time.
-        min_side_px: longer side below which it is enlarged, because modules of few pixels are not read.
-        max_enlargement: factor by which it is enlarged at most.
-        margin: border around the part's outline in which a code still belongs to it, in widths of its box.
-    """
-
-    every: int = 15
-    again_every: int = 60
-    max_side_px: int = 900
-    min_side_px: int = 600
-    max_enlargement: float = 3.0
-    margin: float = 0.02
+EVERY = 15
+"""Frames between two attempts until a code has been read."""
+AGAIN_EVERY = 60
+"""Frames between two attempts afterwards."""
+MAX_SIDE_PX = 900
+"""Longer side of the cut-out of the part beyond which it is reduced; it bounds the time."""
+MIN_SIDE_PX = 600
+"""Longer side below which it is enlarged, because modules of few pixels are not read."""
+MAX_ENLARGEMENT = 3.0
+"""Factor by which it is enlarged at most."""
+MARGIN = 0.02
+"""Border around the part's outline in which a code still belongs to it, in widths of its box."""
 
 
 class SerialCode(NamedTuple):
@@ -127,12 +120,10 @@ class SerialCodeReader:
 
     Args:
         numbers: which texts are serial numbers.
-        options: see `SerialCodeOptions`.
     """
 
-    def __init__(self, numbers: SerialNumbers, options: SerialCodeOptions | None = None) -> None:
+    def __init__(self, numbers: SerialNumbers) -> None:
         self.numbers = numbers
-        self.options = options or SerialCodeOptions()
         self._detectors = {
             name: cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(TAG_FAMILIES[name]))
             for name in numbers.tag_families
@@ -140,7 +131,7 @@ class SerialCodeReader:
 
     def is_due(self, frame: int, has_read: bool) -> bool:
         """Whether the code should be read in a frame, counted from 1."""
-        return frame % (self.options.again_every if has_read else self.options.every) == 1
+        return frame % (AGAIN_EVERY if has_read else EVERY) == 1
 
     def read(self, image: NDArray[np.uint8], hull_px: NDArray[np.float32]) -> str:
         """The serial number within the outline of a part, or empty if there is none or there are different ones.
@@ -158,7 +149,7 @@ class SerialCodeReader:
         if len(hull_px) < 3:
             return []
         height, width = image.shape[:2]
-        border_px = self.options.margin * float(np.ptp(hull_px, axis=0).max())
+        border_px = MARGIN * float(np.ptp(hull_px, axis=0).max())
         low = np.floor(np.maximum(hull_px.min(axis=0) - border_px, 0.0)).astype(int)
         high = np.ceil(np.minimum(hull_px.max(axis=0) + border_px + 1.0, [width, height])).astype(int)
         if (high - low).min() < 8:
@@ -179,11 +170,10 @@ class SerialCodeReader:
 
     def _scales(self, side_px: int) -> list[float]:
         """Scales at which a cut-out with a longer side is read, one after another until a serial number is found."""
-        o = self.options
-        first = min(1.0, o.max_side_px / side_px)
-        if side_px >= o.min_side_px:
+        first = min(1.0, MAX_SIDE_PX / side_px)
+        if side_px >= MIN_SIDE_PX:
             return [first]
-        return [first, min(o.max_enlargement, o.max_side_px / side_px)]
+        return [first, min(MAX_ENLARGEMENT, MAX_SIDE_PX / side_px)]
 
     def _texts(self, gray: NDArray[np.uint8]) -> list[tuple[str, Array]]:
         """Texts and corners (4,2) of all codes in a grey picture."""

@@ -8,7 +8,6 @@ intersections of lines fitted to their sides.
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -23,29 +22,22 @@ CornerKey = tuple[str, int, int]
 """Identifies a corner: what it belongs to (``board 0``, or a dictionary), the id there, and the corner of a tag."""
 
 
-@dataclass(frozen=True)
-class QuadOptions:
-    """Refinement of the four corners of a tag.
-
-    Attributes:
-        reach_px: how far from OpenCV's estimate a side is searched for, and the largest change of a corner accepted.
-        side_range: part of a side that is sampled; near the corners the neighbouring side disturbs the profile.
-        spacing_px: distance between samples along a side.
-        sample_range: smallest and largest number of samples per side.
-        half_width_px, threshold, half_slope: of the profiles, see `find_steps` and `choose_steps`.
-        max_deviation_px: samples farther than this from the median offset of their side are dropped.
-        min_samples: samples that a side needs for a line.
-    """
-
-    reach_px: float = 3.0
-    side_range: tuple[float, float] = (0.12, 0.88)
-    spacing_px: float = 2.0
-    sample_range: tuple[int, int] = (8, 60)
-    half_width_px: float = 1.0
-    threshold: float = 1.0
-    half_slope: float = 6.0
-    max_deviation_px: float = 0.6
-    min_samples: int = 6
+REACH_PX = 3.0
+"""How far from OpenCV's estimate a side is searched for, and the largest change of a corner accepted."""
+SIDE_RANGE = (0.12, 0.88)
+"""Part of a side that is sampled; near the corners the neighbouring side disturbs the profile."""
+SPACING_PX = 2.0
+"""Distance between samples along a side."""
+SAMPLE_RANGE = (8, 60)
+"""Smallest and largest number of samples per side."""
+HALF_WIDTH_PX = 1.0
+THRESHOLD = 1.0
+HALF_SLOPE = 6.0
+"""Of the profiles, see `find_steps` and `choose_steps`."""
+MAX_DEVIATION_PX = 0.6
+"""Samples farther than this from the median offset of their side are dropped."""
+MIN_SAMPLES = 6
+"""Samples that a side needs for a line."""
 
 
 def find_corners(
@@ -84,7 +76,7 @@ def find_corners(
     return found
 
 
-def refined_quad(light: NDArray[np.float32], camera: Camera, quad: Array, options: QuadOptions | None = None) -> Array:
+def refined_quad(light: NDArray[np.float32], camera: Camera, quad: Array) -> Array:
     """Corners (4,2) px of a tag as intersections of its four sides, which are straight once distortion is removed.
 
     OpenCV's corner refinement is made for chessboards: at the isolated corner of a tag its result lies 0.1 to 0.3 px
@@ -94,21 +86,19 @@ def refined_quad(light: NDArray[np.float32], camera: Camera, quad: Array, option
         light: (H,W) linear light, see `linear_light`.
         camera: of the picture, with its distortion.
         quad: (4,2) px corners found by OpenCV.
-        options: see `QuadOptions`.
     """
-    o = options or QuadOptions()
     lines = []
     for a, b in zip(quad, np.roll(quad, -1, axis=0), strict=True):
         along = (b - a) / np.linalg.norm(b - a)
         normal = np.array([-along[1], along[0]])
-        count = int(np.clip(np.linalg.norm(b - a) / o.spacing_px, *o.sample_range))
-        points = a + np.linspace(*o.side_range, count)[:, None] * (b - a)
+        count = int(np.clip(np.linalg.norm(b - a) / SPACING_PX, *SAMPLE_RANGE))
+        points = a + np.linspace(*SIDE_RANGE, count)[:, None] * (b - a)
         normals = np.tile(normal, (count, 1))
-        offsets, slopes, _ = find_steps(light, points, normals, o.reach_px, o.half_width_px, o.threshold)
-        offset, slope = choose_steps(offsets, slopes, 0.5 * o.reach_px, o.half_slope)
+        offsets, slopes, _ = find_steps(light, points, normals, REACH_PX, HALF_WIDTH_PX, THRESHOLD)
+        offset, slope = choose_steps(offsets, slopes, 0.5 * REACH_PX, HALF_SLOPE)
         is_found = slope != 0.0
-        is_found &= np.abs(offset - np.median(offset[is_found])) < o.max_deviation_px if is_found.any() else False
-        if np.count_nonzero(is_found) < o.min_samples:
+        is_found &= np.abs(offset - np.median(offset[is_found])) < MAX_DEVIATION_PX if is_found.any() else False
+        if np.count_nonzero(is_found) < MIN_SAMPLES:
             return quad
         rays = camera.unproject(points[is_found] + offset[is_found, None] * normal)
         # Normal of the plane through the camera's centre that contains the rays of this side.
@@ -117,7 +107,7 @@ def refined_quad(light: NDArray[np.float32], camera: Camera, quad: Array, option
     with np.errstate(divide="ignore", invalid="ignore"):
         refined = camera.project(corners / corners[:, 2:])
     moved = np.linalg.norm(refined - quad, axis=1)
-    return refined if np.all(moved < o.reach_px) else quad
+    return refined if np.all(moved < REACH_PX) else quad
 
 
 def _rows(values: Any, columns: int) -> Array:

@@ -74,11 +74,14 @@ def _run_length(mask: NDArray[np.uint8], u: float, v: float, du: float, dv: floa
 
 @kernel
 def _describe_contour(
-    mask: NDArray[np.uint8], xs: NDArray[np.float64], ys: NDArray[np.float64], starts: NDArray[np.int64],
-    ends_: NDArray[np.int64], half: int, longest: int
-) -> tuple[
-    NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]
-]:  # fmt: skip
+    mask: NDArray[np.uint8],
+    xs: NDArray[np.float64],
+    ys: NDArray[np.float64],
+    starts: NDArray[np.int64],
+    ends_: NDArray[np.int64],
+    half: int,
+    longest: int,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
     """Positions, outward normals and run lengths at the pixels of closed outlines.
 
     Args:
@@ -132,9 +135,13 @@ def _describe_contour(
 
 @kernel
 def _nearest_sample(
-    u: NDArray[np.float64], v: NDArray[np.float64], sample_pixels: NDArray[np.float64], width: int, height: int,
-    reach: float
-) -> NDArray[np.int32]:  # fmt: skip
+    u: NDArray[np.float64],
+    v: NDArray[np.float64],
+    sample_pixels: NDArray[np.float64],
+    width: int,
+    height: int,
+    reach: float,
+) -> NDArray[np.int32]:
     """Index of the nearest sample within ``reach`` px of each (u, v), or -1, found by a grid of pixels."""
     grid = np.full((height, width), -1, dtype=np.int32)
     following = np.full(sample_pixels.shape[0], -1, dtype=np.int32)

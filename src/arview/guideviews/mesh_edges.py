@@ -101,7 +101,7 @@ def mesh_edges(model: Model, crease_angle_deg: float = 30.0) -> MeshEdges:
 @kernel
 def facing(
     eye: NDArray[np.float64], point: NDArray[np.float64], normals: NDArray[np.float64], first: int, second: int
-) -> tuple[float, float]:  # fmt: skip
+) -> tuple[float, float]:
     """How far the two faces at an edge are turned to the eye.
 
     Args:
@@ -125,7 +125,7 @@ def facing(
 @kernel
 def _to_cam(
     rotation: NDArray[np.float64], translation: NDArray[np.float64], point: NDArray[np.float64]
-) -> tuple[float, float, float]:  # fmt: skip
+) -> tuple[float, float, float]:
     """Coordinates of a point (3,) in the camera frame."""
     x = rotation[0, 0] * point[0] + rotation[0, 1] * point[1] + rotation[0, 2] * point[2] + translation[0]
     y = rotation[1, 0] * point[0] + rotation[1, 1] * point[1] + rotation[1, 2] * point[2] + translation[1]
@@ -274,7 +274,20 @@ def sample_visible_edges(
     tolerance = 3.0 * float(np.median(seen)) / fx if seen.size else 1.0
     return ViewEdgeSamples(
         *_sample_visible(
-            edges.vertices_in_model, edges.ends, edges.faces, edges.is_crease, edges.is_sharp, edges.face_normals,
-            edges.component, cam_from_model, fx, fy, cx, cy, depth_mm, spacing_px, tolerance,
+            edges.vertices_in_model,
+            edges.ends,
+            edges.faces,
+            is_crease=edges.is_crease,
+            is_sharp=edges.is_sharp,
+            normals=edges.face_normals,
+            component=edges.component,
+            cam_from_model=cam_from_model,
+            fx=fx,
+            fy=fy,
+            cx=cx,
+            cy=cy,
+            depth=depth_mm,
+            spacing_px=spacing_px,
+            depth_tolerance=tolerance,
         )
-    )  # fmt: skip
+    )

@@ -51,9 +51,14 @@ def surface_about(
 
 @kernel
 def draw_surface(
-    surface: Surface, pose: NDArray[np.float64], focal_px: NDArray[np.float64], center_px: NDArray[np.float64],
-    diameter_mm: float, drawn: NDArray[np.float32], face_ids: NDArray[np.int32]
-) -> None:  # fmt: skip
+    surface: Surface,
+    pose: NDArray[np.float64],
+    focal_px: NDArray[np.float64],
+    center_px: NDArray[np.float64],
+    diameter_mm: float,
+    drawn: NDArray[np.float32],
+    face_ids: NDArray[np.int32],
+) -> None:
     """Draw normals and depth of a surface in the view of an ideal camera.
 
     Args:
@@ -81,7 +86,19 @@ def draw_surface(
                 seen[i, a] += pose[a, b] * points[i, b]
     cx, cy = center_px[0] - focal_px[0] * place[0] / place[2], center_px[1] - focal_px[1] * place[1] / place[2]
     inverse_depth = np.zeros((height, width))
-    fill_buffers(seen, faces, focal_px[0], focal_px[1], cx, cy, NEAR_SHARE * diameter_mm, 0, 0, inverse_depth, face_ids)
+    fill_buffers(
+        seen,
+        faces,
+        focal_px[0],
+        fy=focal_px[1],
+        cx=cx,
+        cy=cy,
+        near=NEAR_SHARE * diameter_mm,
+        x_low=0,
+        y_low=0,
+        inverse_depth=inverse_depth,
+        face_ids=face_ids,
+    )
     half_mm = 0.5 * diameter_mm
     for v in range(height):
         for u in range(width):

@@ -171,7 +171,7 @@ class GuideViewSet:
             "options": asdict(self.options),
             "center_in_model": self.center_in_model.tolist(),
             "diameter_mm": self.diameter_mm,
-        }  # fmt: skip
+        }
         arrays = {"poses": self.poses, "directions": self.directions, **self.arrays}
         write_arrays(Path(path), meta, arrays, is_packed)
 

@@ -43,12 +43,12 @@ def from_document(document: dict[str, Any]) -> Inspection:
             source["tool"],
             source["version"],
             source["method"],
-            source.get("note", ""),
-            source.get("photos_hash", ""),
-            source.get("photos", 0),
-            tuple(source.get("software", {}).items()),
-            tuple(source.get("options", {}).items()),
-            source.get("cpu_s"),
+            note=source.get("note", ""),
+            photos_hash=source.get("photos_hash", ""),
+            photos=source.get("photos", 0),
+            software=tuple(source.get("software", {}).items()),
+            options=tuple(source.get("options", {}).items()),
+            cpu_s=source.get("cpu_s"),
         ),
         datum_system=None if datums is None else from_json(DatumSystem, datums),
         warnings=tuple(document.get("warnings", ())),
@@ -100,9 +100,12 @@ def to_document(inspection: Inspection) -> dict[str, Any]:
     source = inspection.provenance
     software, options = dict(source.software), dict(source.options)
     more: dict[str, Any] = {
-        "photos_hash": source.photos_hash, "photos": source.photos, "software": software, "options": options,
+        "photos_hash": source.photos_hash,
+        "photos": source.photos,
+        "software": software,
+        "options": options,
         "cpu_s": source.cpu_s,
-    }  # fmt: skip
+    }
     document: dict[str, Any] = {
         "schema_version": SCHEMA_VERSION,
         "part": inspection.part,

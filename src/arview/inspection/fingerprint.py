@@ -31,14 +31,16 @@ def values_fingerprint(inspection: Inspection) -> str:
 
     It stays the same when the record is written again with other remarks, or with a cloud that changes no value.
     """
-    foreign = [(list(map(_rounded, one.center_mm)), list(map(_rounded, one.size_mm))) for one in
-               inspection.foreign_objects]  # fmt: skip
+    foreign = [
+        (list(map(_rounded, one.center_mm)), list(map(_rounded, one.size_mm))) for one in inspection.foreign_objects
+    ]
     return content_hash(
         {
             **_origin(inspection, inspection.provenance.photos_hash),
-            "components": [_values(one) for one in inspection.components], "foreign_objects": foreign,
+            "components": [_values(one) for one in inspection.components],
+            "foreign_objects": foreign,
         }
-    )  # fmt: skip
+    )
 
 
 def component_fingerprint(inspection: Inspection, component: ComponentDeviation, photos_hash: str | None = None) -> str:
@@ -55,9 +57,11 @@ def component_fingerprint(inspection: Inspection, component: ComponentDeviation,
 
 def _origin(inspection: Inspection, photos_hash: str) -> dict[str, Any]:
     return {
-        "part": inspection.part, "serial": inspection.serial, "model_hash": inspection.model_hash,
+        "part": inspection.part,
+        "serial": inspection.serial,
+        "model_hash": inspection.model_hash,
         "photos_hash": photos_hash,
-    }  # fmt: skip
+    }
 
 
 def _values(one: ComponentDeviation) -> dict[str, Any]:

@@ -35,9 +35,14 @@ from arview.reconstruction.types import SparseModel
 
 
 def measure_again(
-    reconstruction: MetricReconstruction, part: Part, components: Sequence[str], added: Sequence[str],
-    options: MeasureOptions | None = None, *, progress: Progress | None = None,
-) -> Inspection:  # fmt: skip
+    reconstruction: MetricReconstruction,
+    part: Part,
+    components: Sequence[str],
+    added: Sequence[str],
+    options: MeasureOptions | None = None,
+    *,
+    progress: Progress | None = None,
+) -> Inspection:
     """Measure components where the added photos show them, in the datum frame that the earlier photos show.
 
     The covariance of all poses together is propagated, so that U includes how well the added photos are placed among
@@ -67,16 +72,19 @@ def measure_again(
         first = replace(reconstruction, sparse=earlier)
         datums = measure_all(first, views, part, base, options, tell)
         tell("datums", 0, 1)
-        alignment, failed = align_to_datums(first, views, part, base, datums, options)
+        alignment, failed = align_to_datums(first, views, part, base, datums)
         results = measure_all(
             replace(reconstruction, sparse=later), load_views(later, part.model), part, components, options, tell
         )
         poses = None
         if sparse.pose_covariance is not None:
             poses = PosePropagation(
-                sparse, part.model, alignment, base,
+                sparse,
+                part.model,
+                alignment,
+                base,
                 used=lambda name: is_added if name in components else ~is_added,
-            )  # fmt: skip
+            )
         seen = seen_from(later, part.model)
         records: list[ComponentDeviation] = []
         for name in components:
@@ -113,6 +121,10 @@ def _some(sparse: SparseModel, chosen: NDArray[np.bool_]) -> SparseModel:
     photos = tuple(photo for photo, is_chosen in zip(sparse.photos, chosen, strict=True) if is_chosen)
     none = np.zeros(0, dtype=np.int32)
     return replace(
-        sparse, photos=photos, pose_covariance=None, observed_point=none, observed_photo=none,
+        sparse,
+        photos=photos,
+        pose_covariance=None,
+        observed_point=none,
+        observed_photo=none,
         observed_px=np.zeros((0, 2)),
-    )  # fmt: skip
+    )

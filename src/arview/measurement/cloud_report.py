@@ -26,9 +26,12 @@ from arview.reconstruction.types import DenseCloud
 
 
 def inspect_cloud(
-    cloud: DenseCloud, model: Model, alignment: Alignment, deviations: Sequence[ComponentDeviation],
+    cloud: DenseCloud,
+    model: Model,
+    alignment: Alignment,
+    deviations: Sequence[ComponentDeviation],
     folder: Path | None = None,
-) -> tuple[tuple[ForeignReport, ...], DistanceReport | None]:  # fmt: skip
+) -> tuple[tuple[ForeignReport, ...], DistanceReport | None]:
     """Find foreign objects in a cloud, and compute its distances to the CAD in the datum frame.
 
     Args:
@@ -43,8 +46,11 @@ def inspect_cloud(
     """
     datum_from_rough = invert(alignment.rough_from_datum)
     aligned = replace(cloud, points=apply(datum_from_rough, np.asarray(cloud.points, dtype=np.float64)))
-    places = {d.name: np.array(d.details.measured_from_nominal) for d in deviations
-              if d.details is not None and d.details.measured_from_nominal is not None}  # fmt: skip
+    places = {
+        d.name: np.array(d.details.measured_from_nominal)
+        for d in deviations
+        if d.details is not None and d.details.measured_from_nominal is not None
+    }
     unknown = [d.name for d in deviations if d.verdict is Verdict.NOT_MEASURED]
     try:
         found = find_foreign(aligned, model, places, unknown)

@@ -100,7 +100,7 @@ def read_folder(folder: str | Path, photos: str | Path | None = None, with_cloud
 
 def read_cloud(
     path: str | Path, model: Model | None = None, unit: str | None = None, rescales: bool = False
-) -> MetricReconstruction:  # fmt: skip
+) -> MetricReconstruction:
     """Read a cloud without photos, in any frame, with or without normals.
 
     Args:
@@ -155,10 +155,24 @@ def _cloud_alone(cloud: DenseCloud, warnings: tuple[str, ...], factors: tuple[fl
     """A reconstruction without photos."""
     none = np.zeros(0)
     empty = SparseModel(
-        (), np.zeros((0, 3)), np.zeros((0, 3), np.uint8), none, none.astype(np.int32), none.astype(np.int32),
+        (),
+        np.zeros((0, 3)),
+        np.zeros((0, 3), np.uint8),
+        none,
+        none.astype(np.int32),
+        none.astype(np.int32),
         np.zeros((0, 2)),
-    )  # fmt: skip
-    scale = ScaleResult(1.0, None, None, None, (), warnings, "a cloud without photos", Consistency(True, ""))
+    )
+    scale = ScaleResult(
+        1.0,
+        None,
+        None,
+        covariance=None,
+        evidence=(),
+        warnings=warnings,
+        why_no_frame="a cloud without photos",
+        consistency=Consistency(True, ""),
+    )
     return MetricReconstruction(empty, scale, cloud, factors)
 
 
@@ -199,9 +213,13 @@ def in_model_frame(reconstruction: MetricReconstruction, part: Part) -> MetricRe
         std = _SCALE_STD
         evidence = (ScaleEvidence("cad", found.scale, std, "the cloud's shape"),)
     scale = replace(
-        scale, scale=found.scale * (scale.scale or 1.0), scale_std=std, model_from_scan=found.model_from_scan,
-        evidence=evidence, warnings=tuple(warnings),
-    )  # fmt: skip
+        scale,
+        scale=found.scale * (scale.scale or 1.0),
+        scale_std=std,
+        model_from_scan=found.model_from_scan,
+        evidence=evidence,
+        warnings=tuple(warnings),
+    )
     return MetricReconstruction(reconstruction.sparse.transformed(found.scale, found.model_from_scan), scale, moved)
 
 

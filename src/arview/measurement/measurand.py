@@ -16,15 +16,14 @@ from arview.errors import InputError
 from arview.geometry import Array
 from arview.measurement.photo.patches import near_others, symmetries_of, tangents_of
 
-
-@dataclass(frozen=True)
-class MeasurandOptions:
-    """Thresholds for the surface on which a component stands."""
-
-    contact_mm: float = 0.3  # surfaces this near to another component stand on it; CAD leaves gaps for welds and glue
-    samples: int = 4000  # on the surface of a component, where no whole face is in contact
-    min_samples: int = 10  # samples that make a contact
-    min_coherence: float = 0.7  # length of the mean normal of the contact for it to be one flat seat
+CONTACT_MM = 0.3
+"""Surfaces this near to another component stand on it; CAD leaves gaps for welds and glue."""
+SAMPLES = 4000
+"""On the surface of a component, where no whole face is in contact."""
+MIN_SAMPLES = 10
+"""Samples that make a contact."""
+MIN_COHERENCE = 0.7
+"""Length of the mean normal of the contact for it to be one flat seat."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +55,7 @@ class Measurand:
         return np.stack([first, np.cross(axis, first), axis])
 
 
-def measurand_of(name: str, part: Part, options: MeasurandOptions | None = None) -> Measurand:
+def measurand_of(name: str, part: Part) -> Measurand:
     """The measurand of a component by the part file; its centre of mass unless another point is named.
 
     The centre of mass of what is round lies on its axis.
@@ -64,10 +63,9 @@ def measurand_of(name: str, part: Part, options: MeasurandOptions | None = None)
     Raises:
         InputError: the component has no such point; the message names the component.
     """
-    o = options or MeasurandOptions()
     component = part.model.component(name)
     settings = part.component_settings(name)
-    seat = seat_of(component, part.model, o)
+    seat = seat_of(component, part.model)
     symmetries = symmetries_of(component, part)
     axis, axis_from = _own_axis(component, symmetries, seat)
     kind, point = _point(name, part, component, symmetries, seat)
@@ -95,9 +93,8 @@ class Seat:
     normal: Array | None
 
 
-def seat_of(component: Component, model: Model, options: MeasurandOptions | None = None) -> Seat | None:
+def seat_of(component: Component, model: Model) -> Seat | None:
     """The surface in contact with other components; None if it touches none."""
-    o = options or MeasurandOptions()
     corners = component.vertices_in_model[component.faces]
     areas = face_areas(component.vertices_in_model, component.faces.astype(np.int64))
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -107,18 +104,18 @@ def seat_of(component: Component, model: Model, options: MeasurandOptions | None
     places = np.concatenate(
         [corners, 0.5 * (corners + np.roll(corners, 1, axis=1)), corners.mean(axis=1, keepdims=True)], axis=1
     )
-    near = near_others(places.reshape(-1, 3), model, index, o.contact_mm).reshape(places.shape[:2]).all(axis=1)
+    near = near_others(places.reshape(-1, 3), model, index, CONTACT_MM).reshape(places.shape[:2]).all(axis=1)
     if areas[near].sum() > 0.01 * areas.sum():
         middles, weights, directions = corners.mean(axis=1)[near], areas[near], normals[near]
     else:
-        samples = sample_surface(component, 0.0, o.samples)
-        touching = samples.of(near_others(samples.points, model, index, o.contact_mm))
-        if len(touching.points) < o.min_samples:
+        samples = sample_surface(component, 0.0, SAMPLES)
+        touching = samples.of(near_others(samples.points, model, index, CONTACT_MM))
+        if len(touching.points) < MIN_SAMPLES:
             return None
         middles, weights, directions = touching.points, np.ones(len(touching.points)), touching.normals
     mean = np.average(directions, axis=0, weights=weights)
     length = float(np.linalg.norm(mean))
-    normal = -mean / length if length > o.min_coherence else None
+    normal = -mean / length if length > MIN_COHERENCE else None
     return Seat(np.average(middles, axis=0, weights=weights), normal)
 
 

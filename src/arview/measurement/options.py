@@ -4,12 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
 
 from arview.errors import InputError
-from arview.measurement.datums.equations import AlignmentOptions
-from arview.measurement.datums.options import DatumOptions
-from arview.measurement.photo import PhotoOptions
 from arview.measurement.types import Method, Move, NotMeasured
 from arview.measurement.uncertainty.budget import UncertaintyOptions
 from arview.measurement.uncertainty.combine import CombinedMove, combine
@@ -27,12 +23,7 @@ class MeasureOptions:
     tolerance_mm: float | None = None  # for components without a tolerance in the part file; None: no verdict
     corrects_bias: bool = False  # decide on the most likely true distance instead of the measured one
     uses_inconsistent: bool = False  # continue though the reconstruction does not have the shape of the CAD
-    rough_std_mm: float = 0.3  # standard uncertainty of the rough frame, where neither datums nor base give a frame
-    registration: Literal["surface", "icp"] = "surface"  # in the cloud: to the CAD's exact surface, or by classical ICP
     maps_folder: Path | None = None  # where pictures and PLY of the distance map are written; None: nowhere
-    photo: PhotoOptions = field(default_factory=PhotoOptions)
-    datums: DatumOptions = field(default_factory=DatumOptions)
-    alignment: AlignmentOptions = field(default_factory=AlignmentOptions)
     uncertainty: UncertaintyOptions = field(default_factory=UncertaintyOptions)
     decision: DecisionOptions = field(default_factory=DecisionOptions)
 

@@ -33,7 +33,7 @@ from arview.measurement.measurand import Measurand
 from arview.measurement.options import ComponentMeasurement, MeasureOptions, combined_of
 from arview.measurement.photo.patches import free_directions
 from arview.measurement.types import Move
-from arview.measurement.uncertainty.budget import MeasuredPlacement, place, relative_twists
+from arview.measurement.uncertainty.budget import FORM_MM, PROBABILITY, K, MeasuredPlacement, place, relative_twists
 from arview.measurement.uncertainty.combine import Agreement, CombinedMove, agreements, quantile_of_length
 from arview.measurement.uncertainty.decision import decide, worst, zone_diameter_mm
 from arview.measurement.uncertainty.pose_propagation import PosePropagation
@@ -44,9 +44,14 @@ _SOFTWARE = ("numpy", "scipy", "opencv-contrib-python-headless", "pycolmap", "nu
 
 
 def component_record(
-    name: str, measured: ComponentMeasurement, measurand: Measurand, alignment: Alignment,
-    poses: PosePropagation | None, part: Part, options: MeasureOptions,
-) -> ComponentDeviation:  # fmt: skip
+    name: str,
+    measured: ComponentMeasurement,
+    measurand: Measurand,
+    alignment: Alignment,
+    poses: PosePropagation | None,
+    part: Part,
+    options: MeasureOptions,
+) -> ComponentDeviation:
     """Position of a component's stated point in the datum frame, with its verdict."""
     settings = part.component_settings(name)
     tolerance_mm = settings.position_tolerance_mm or options.tolerance_mm
@@ -63,9 +68,17 @@ def component_record(
         is_unseen = not is_missing and all(f.is_unseen for f in measured.failures if f.method != "cloud")
         presence = MeasuredPresence.NOT_SEEN if is_unseen else MeasuredPresence.UNKNOWN
         return ComponentDeviation(
-            name, (None, None, None), None, nothing, None, tolerance_mm, verdict, finding=finding, details=details,
+            name,
+            (None, None, None),
+            None,
+            nothing,
+            None,
+            tolerance_mm,
+            verdict,
+            finding=finding,
+            details=details,
             presence=MeasuredPresence.MISSING if is_missing else presence,
-        )  # fmt: skip
+        )
     by_poses = None if poses is None else poses.covariance_of(component, center)
     together = together.at(center)
     moves = [move.at(center) for move in measured.moves]
@@ -97,7 +110,9 @@ def component_record(
         twist_deg=twist_deg,
         presence=MeasuredPresence.PRESENT,
         details=replace(
-            _details(placed, together, measurand, settings), methods=methods, notes=tuple(notes),
+            _details(placed, together, measurand, settings),
+            methods=methods,
+            notes=tuple(notes),
             agreement=tuple(
                 MethodAgreement(
                     (p.first, p.second), p.difference_mm, p.joint_mm, max(p.ratio, p.mixed_ratio) <= 1.0, p.mixed_ratio
@@ -105,13 +120,17 @@ def component_record(
                 for p in pairs
             ),
         ),
-    )  # fmt: skip
+    )
 
 
 def _verdict(
-    placed: MeasuredPlacement, tolerance_mm: float | None, settings: ComponentSettings, free: Array,
-    options: MeasureOptions, notes: list[str],
-) -> Verdict:  # fmt: skip
+    placed: MeasuredPlacement,
+    tolerance_mm: float | None,
+    settings: ComponentSettings,
+    free: Array,
+    options: MeasureOptions,
+    notes: list[str],
+) -> Verdict:
     """Verdict on the position and, where it has a tolerance, the angle; what could not be judged cannot pass.
 
     Rotations that the component's symmetry leaves free (K,6) are not judged.
@@ -145,9 +164,10 @@ def _unjudged(placed: MeasuredPlacement, free: Array, angle_tolerance_deg: float
     if len(hidden):
         texts.append(f"the displacement along {' and '.join(_direction_text(axis) for axis in hidden)} is undetermined")
     turned = [
-        axis for axis in placed.axes[~placed.own_observable[:3]]
+        axis
+        for axis in placed.axes[~placed.own_observable[:3]]
         if not len(free) or np.linalg.norm(axis - np.linalg.pinv(free[:, :3]) @ free[:, :3] @ axis) > 0.05
-    ]  # fmt: skip
+    ]
     if turned and angle_tolerance_deg is not None:
         axes = " and ".join(_direction_text(axis) for axis in turned)
         texts.append(
@@ -208,9 +228,15 @@ def _method_result(move: Move, alignment: Alignment) -> MethodResult:
 
     seen = move.observable
     return MethodResult(
-        move.method, shown(twist[3:], seen[3:]), shown(np.rad2deg(twist[:3]), seen[:3]), shown(std[3:], seen[3:]),
-        move.used, move.residual_mm, move.support, notes=move.notes,
-    )  # fmt: skip
+        move.method,
+        shown(twist[3:], seen[3:]),
+        shown(np.rad2deg(twist[:3]), seen[:3]),
+        shown(std[3:], seen[3:]),
+        move.used,
+        move.residual_mm,
+        move.support,
+        notes=move.notes,
+    )
 
 
 def tilt_and_twist(placed: MeasuredPlacement) -> tuple[float | None, float | None]:
@@ -248,30 +274,47 @@ def datum_doubts(alignment: Alignment) -> list[str]:
 
 
 def datum_record(
-    alignment: Alignment, part: Part, base: Sequence[str], reconstruction: MetricReconstruction,
+    alignment: Alignment,
+    part: Part,
+    base: Sequence[str],
+    reconstruction: MetricReconstruction,
     failed: tuple[FailedDatum, ...] = (),
-) -> DatumSystem:  # fmt: skip
+) -> DatumSystem:
     """The datum system of an inspection."""
     components = {datum.label: datum.component for datum in part.datums}
     features = {datum.label: datum.feature for datum in part.datums if datum.feature != "fit"}
     reports = tuple(
         DatumReport(
-            one.label, features.get(one.label, one.feature), components.get(one.label, base[0]), one.locked, one.used,
-            one.of, one.residual_mm, one.rest_mm, one.radius_mm,
-            _datum_method(one, features) if reconstruction.sparse.photos else "cloud",
+            one.label,
+            features.get(one.label, one.feature),
+            components.get(one.label, base[0]),
+            locked=one.locked,
+            used=one.used,
+            of=one.of,
+            residual_mm=one.residual_mm,
+            rest_mm=one.rest_mm,
+            radius_mm=one.radius_mm,
+            method=_datum_method(one, features) if reconstruction.sparse.photos else "cloud",
         )
         for one in alignment.datums
-    )  # fmt: skip
+    )
     notes = alignment.notes
     if not part.datums:
         notes = (f"no datums in the part file: best fit of {', '.join(base)}", *notes)
     scale = reconstruction.scale
     used = [evidence.detail for evidence in scale.evidence if evidence.is_used]
     return DatumSystem(
-        reports, _matrix(alignment.rough_from_datum), _matrix(alignment.covariance), _three(alignment.origin_in_model),
-        scale.scale, scale.scale_std, "; ".join(used), notes, failed,
-        "partial" if failed else "datums" if part.datums else "best_fit",
-    )  # fmt: skip
+        reports,
+        _matrix(alignment.rough_from_datum),
+        _matrix(alignment.covariance),
+        origin_mm=_three(alignment.origin_in_model),
+        mm_per_unit=scale.scale,
+        scale_std=scale.scale_std,
+        scale_from="; ".join(used),
+        notes=notes,
+        not_measured=failed,
+        frame="partial" if failed else "datums" if part.datums else "best_fit",
+    )
 
 
 def _datum_method(one: DatumResult, features: Mapping[str, str]) -> str:
@@ -305,11 +348,11 @@ def provenance_of(reconstruction: MetricReconstruction, options: MeasureOptions,
     asked = {
         "methods": ",".join(options.methods),
         "guard": f"{options.decision.guard:g}",
-        "k": f"{options.uncertainty.k:g}",
-        "probability": f"{options.uncertainty.probability:g}",
+        "k": f"{K:g}",
+        "probability": f"{PROBABILITY:g}",
         "monte_carlo": str(options.uncertainty.draws if options.uncertainty.monte_carlo else 0),
         "seed": str(options.uncertainty.seed),
-        "form_mm": f"{options.uncertainty.form_mm:g}",
+        "form_mm": f"{FORM_MM:g}",
         "corrects_bias": str(options.corrects_bias).lower(),
     }
     return Provenance(

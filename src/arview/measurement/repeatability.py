@@ -38,9 +38,13 @@ BUDGET_LINE = "halves of the photos differ"
 
 
 def measure_halves(
-    reconstruction: MetricReconstruction, halves: Sequence[SparseModel], part: Part,
-    options: MeasureOptions | None = None, *, progress: Progress | None = None,
-) -> Repeatability:  # fmt: skip
+    reconstruction: MetricReconstruction,
+    halves: Sequence[SparseModel],
+    part: Part,
+    options: MeasureOptions | None = None,
+    *,
+    progress: Progress | None = None,
+) -> Repeatability:
     """Measure two halves of the photos apart, each in its own datum frame, and compare them.
 
     Args:
@@ -67,9 +71,11 @@ def measure_halves(
     rows = tuple(compare(a, b) for a, b in zip(measured[0].components, measured[1].components, strict=True))
     known = [row.difference_mm for row in rows if row.difference_mm is not None]
     return Repeatability(
-        tuple(len(half.photos) for half in halves), rows,
-        float(np.sqrt(np.mean(np.square(known)))) if known else None, round(time.process_time() - began, 2),
-    )  # fmt: skip
+        tuple(len(half.photos) for half in halves),
+        rows,
+        float(np.sqrt(np.mean(np.square(known)))) if known else None,
+        round(time.process_time() - began, 2),
+    )
 
 
 def compare(first: ComponentDeviation, second: ComponentDeviation) -> HalvesDifference:
@@ -149,10 +155,12 @@ def _widened(one: ComponentDeviation, halves: HalvesDifference, options: Measure
         f" ({halves.joint_mm:.3f} mm)"
     )
     details = replace(
-        details, covariance=tuple(tuple(float(v) for v in row) for row in covariance), budget=tuple(budget),
+        details,
+        covariance=tuple(tuple(float(v) for v in row) for row in covariance),
+        budget=tuple(budget),
         interval_mm=(max(0.0, one.distance_mm - uncertainty), one.distance_mm + uncertainty),
         notes=(*details.notes, note),
-    )  # fmt: skip
+    )
     value = details.corrected_distance_mm if options.corrects_bias else one.distance_mm
     by_position = decide(value, uncertainty, one.tolerance_mm, options.decision.guard)
     verdict = one.verdict

@@ -46,11 +46,17 @@ from arview.measurement.uncertainty.combine import CombinedMove
 from arview.measurement.uncertainty.pose_propagation import PosePropagation
 from arview.reconstruction.scale.cad import base_names
 
+ROUGH_STD_MM = 0.3
+"""Standard uncertainty of the rough frame, where neither datums nor base give a frame."""
+
 
 def measure(
-    reconstruction: MetricReconstruction | str | Path, part: Part, options: MeasureOptions | None = None,
-    *, progress: Progress | None = None,
-) -> Inspection:  # fmt: skip
+    reconstruction: MetricReconstruction | str | Path,
+    part: Part,
+    options: MeasureOptions | None = None,
+    *,
+    progress: Progress | None = None,
+) -> Inspection:
     """Measure every inspected component in the datum frame, with its uncertainty and verdict.
 
     Args:
@@ -72,9 +78,7 @@ def measure(
         return _measure(reconstruction, part, options or MeasureOptions(), progress or (lambda what, done, total: None))
 
 
-def _measure(
-    reconstruction: MetricReconstruction, part: Part, options: MeasureOptions, tell: Progress
-) -> Inspection:  # fmt: skip
+def _measure(reconstruction: MetricReconstruction, part: Part, options: MeasureOptions, tell: Progress) -> Inspection:
     """The steps of `measure`, on the rough frame of the reconstruction."""
     began = time.process_time()
     warnings = list(reconstruction.scale.warnings)
@@ -97,7 +101,7 @@ def _measure(
     views = load_views(replace(reconstruction.sparse, pose_covariance=None), part.model) if has_photos else None
     results = measure_all(reconstruction, views, part, [*base, *names], options, tell)
     tell("datums", 0, 1)
-    alignment, failed = align_to_datums(reconstruction, views, part, base, results, options)
+    alignment, failed = align_to_datums(reconstruction, views, part, base, results)
     warnings += [*(failed_datum_text(one) for one in failed), *datum_doubts(alignment)]
     poses = None
     if views is None:
@@ -133,9 +137,13 @@ def _measure(
 
 
 def measure_all(
-    reconstruction: MetricReconstruction, views: PhotoViews | None, part: Part, names: Sequence[str],
-    options: MeasureOptions, tell: Progress,
-) -> dict[str, ComponentMeasurement]:  # fmt: skip
+    reconstruction: MetricReconstruction,
+    views: PhotoViews | None,
+    part: Part,
+    names: Sequence[str],
+    options: MeasureOptions,
+    tell: Progress,
+) -> dict[str, ComponentMeasurement]:
     """Measure every component by every requested method, in the rough frame."""
     found: dict[str, list[Move | NotMeasured]] = {name: [] for name in names}
     if views is not None and {"sweep", "edges"} & set(options.methods):
@@ -143,11 +151,11 @@ def measure_all(
         def step(name: str, share: float) -> None:
             tell("components", round(share * len(names)), len(names))
 
-        both = measure_components_in_photos(views, part, part.model, options.photo, step, names)
+        both = measure_components_in_photos(views, part, part.model, step, names)
         for name, by_method in both.items():
             found[name] += [by_method[method] for method in options.methods if method in by_method]
     if "cloud" in options.methods and reconstruction.cloud is not None:
-        from arview.measurement.cloud.deviation import CloudDeviationOptions, measure_components_in_cloud
+        from arview.measurement.cloud.deviation import measure_components_in_cloud
 
         tell("cloud", 0, 1)
         try:
@@ -156,7 +164,6 @@ def measure_all(
                 part.model,
                 part,
                 reconstruction.sparse.photos,
-                CloudDeviationOptions(way=options.registration),
                 names=names if views is None else None,
             )
         except InputError as error:
@@ -179,9 +186,12 @@ def measure_all(
 
 
 def align_to_datums(
-    reconstruction: MetricReconstruction, views: PhotoViews | None, part: Part, base: Sequence[str],
-    results: Mapping[str, ComponentMeasurement], options: MeasureOptions,
-) -> tuple[Alignment, tuple[FailedDatum, ...]]:  # fmt: skip
+    reconstruction: MetricReconstruction,
+    views: PhotoViews | None,
+    part: Part,
+    base: Sequence[str],
+    results: Mapping[str, ComponentMeasurement],
+) -> tuple[Alignment, tuple[FailedDatum, ...]]:
     """The datum frame of the part file, and the datums that could not be measured.
 
     What they leave free follows from the base's fit, as does all without datums.
@@ -194,12 +204,14 @@ def align_to_datums(
     fits = {name: _rest_of_base(results[name], fitted[name], part) for name in base if name in fitted}
     rest = next(iter(fits.values()), None)
     found = measure_each(
-        part.datums, _datum_measurement(reconstruction, views, part, fitted, options), part.model, rest,
-        options.alignment,
-    )  # fmt: skip
+        part.datums,
+        _datum_measurement(reconstruction, views, part, fitted),
+        part.model,
+        rest,
+    )
     equations = found.equations
     if not part.datums and views is not None:
-        equations = _plane_of_base(views, part.model, base, options)
+        equations = _plane_of_base(views, part.model, base)
         if equations and base[0] in fitted:
             rest = _rest_of_base(results[base[0]], fitted[base[0]], part, is_flat=True)
     if rest is None and not equations:
@@ -216,44 +228,55 @@ def align_to_datums(
     scale_std = reconstruction.scale.scale_std or 0.0
     finds_scale = bool(kinds) and kinds <= {"cad"}
     if found.failed and rest is None:
-        rest = _rough_frame(origin, size_mm, options)
-    return align(equations, origin, size_mm, rest, scale_std, finds_scale, options.alignment), found.failed
+        rest = _rough_frame(origin, size_mm)
+    return align(equations, origin, size_mm, rest, scale_std, finds_scale), found.failed
 
 
 def _datum_measurement(
-    reconstruction: MetricReconstruction, views: PhotoViews | None, part: Part, fitted: Mapping[str, Move],
-    options: MeasureOptions,
-) -> MeasureDatum:  # fmt: skip
+    reconstruction: MetricReconstruction,
+    views: PhotoViews | None,
+    part: Part,
+    fitted: Mapping[str, Move],
+) -> MeasureDatum:
     """The function that measures one datum, in the photos or in the cloud."""
 
     def measure_one(datum: Datum) -> DatumEquations:
         if views is not None:
-            return measure_datums_in_photos((datum,), views, fitted, options.datums)[0]
+            return measure_datums_in_photos((datum,), views, fitted)[0]
         assert reconstruction.cloud is not None
-        return measure_datums_in_cloud((datum,), part.model, reconstruction.cloud, fitted, options.datums)[0]
+        return measure_datums_in_cloud((datum,), part.model, reconstruction.cloud, fitted)[0]
 
     return measure_one
 
 
-def _rough_frame(origin: Array, size_mm: float, options: MeasureOptions) -> DatumEquations:
+def _rough_frame(origin: Array, size_mm: float) -> DatumEquations:
     """Equations of the rough frame of the reconstruction, for what neither datums nor base determine."""
-    std = options.rough_std_mm
+    std = ROUGH_STD_MM
     covariance = np.diag([(std / size_mm) ** 2] * 3 + [std**2] * 3)
-    move = Move("part", "sweep", origin, np.zeros(6), covariance, np.zeros((0, 6)), size_mm, 0, 0.0, 1.0)
+    move = Move(
+        "part",
+        "sweep",
+        origin,
+        twist=np.zeros(6),
+        covariance=covariance,
+        undetermined=np.zeros((0, 6)),
+        radius_mm=size_mm,
+        used=0,
+        residual_mm=0.0,
+        support=1.0,
+    )
     return move_equations("the rough frame", move)[0]
 
 
-def _plane_of_base(
-    views: PhotoViews, model: Model, base: Sequence[str], options: MeasureOptions
-) -> list[DatumEquations]:
+def _plane_of_base(views: PhotoViews, model: Model, base: Sequence[str]) -> list[DatumEquations]:
     """Equations of the base's large flat face, whose height is known better than that of its edges; or none."""
     component = model.component(base[0])
     plane = base_plane(component, views.centres.mean(axis=0) - component.bounds_in_model.mean(axis=0))
     if plane is None:
         return []
     try:
-        equations = measure_datums_in_photos((plane,), views, {}, options.datums)
-        check_covered(equations[0], options.alignment)
+        equations = measure_datums_in_photos((plane,), views, {})
+        check_covered(equations[0])
     except InputError:
         return []
     return equations
@@ -273,9 +296,17 @@ def _as_move(name: str, together: CombinedMove) -> Move:
     """The combined move as that of one method."""
     covariance = np.sum([*together.covariances.values(), together.disagreement], axis=0)
     return Move(
-        name, "sweep", together.center_in_model, together.twist, covariance, together.undetermined,
-        together.radius_mm, 0, 0.0, 1.0,
-    )  # fmt: skip
+        name,
+        "sweep",
+        together.center_in_model,
+        twist=together.twist,
+        covariance=covariance,
+        undetermined=together.undetermined,
+        radius_mm=together.radius_mm,
+        used=0,
+        residual_mm=0.0,
+        support=1.0,
+    )
 
 
 def _bounds(model: Model, names: Sequence[str]) -> Array:

@@ -7,9 +7,12 @@ from dataclasses import dataclass, replace
 
 from arview.cad.model import Model
 from arview.inspection import ComponentDeviation, Finding, MeasuredPresence, Verdict
-from arview.reconstruction.coverage import ComponentCoverage, CoverageOptions, coverage
+from arview.reconstruction.coverage import DIRECTIONS_WANTED, PHOTOS_WANTED, ComponentCoverage, coverage
 from arview.reconstruction.scale.types import Consistency
 from arview.reconstruction.types import SparseModel
+
+HIDDEN_EDGES = 0.25
+"""Share of the CAD's edges, beyond chance, below which most of the part is hidden."""
 
 
 @dataclass(frozen=True)
@@ -17,22 +20,19 @@ class SeenFrom:
     """Photos and directions from which each component is seen, and the options by which they are few."""
 
     components: Mapping[str, ComponentCoverage]
-    options: CoverageOptions
 
 
-def seen_from(sparse: SparseModel, model: Model, options: CoverageOptions | None = None) -> SeenFrom:
+def seen_from(sparse: SparseModel, model: Model) -> SeenFrom:
     """What the photos show of each component; nothing without photos.
 
     Args:
         sparse: the photos, in the frame of the model.
         model: the nominal CAD.
-        options: see `CoverageOptions`.
     """
-    options = options or CoverageOptions()
     if not sparse.photos:
-        return SeenFrom({}, options)
-    found = coverage(model, [(photo.camera, photo.cam_from_scan) for photo in sparse.photos], options)
-    return SeenFrom({one.name: one for one in found.components}, options)
+        return SeenFrom({})
+    found = coverage(model, [(photo.camera, photo.cam_from_scan) for photo in sparse.photos])
+    return SeenFrom({one.name: one for one in found.components})
 
 
 def with_seen_from(record: ComponentDeviation, seen: SeenFrom) -> ComponentDeviation:
@@ -40,17 +40,17 @@ def with_seen_from(record: ComponentDeviation, seen: SeenFrom) -> ComponentDevia
     covered = seen.components.get(record.name)
     if covered is None or record.details is None:
         return record
-    note = _few(covered, seen.options, record.distance_mm is not None)
+    note = _few(covered, record.distance_mm is not None)
     notes = (*record.details.notes, *((note,) if note else ()))
     return replace(record, details=replace(record.details, photos=len(covered.photos), notes=notes))
 
 
-def is_mostly_hidden(consistency: Consistency, options: CoverageOptions | None = None) -> bool:
+def is_mostly_hidden(consistency: Consistency) -> bool:
     """Whether most of the CAD's edges are hidden in the photos, although what is seen of the part fits."""
     share, chance = consistency.edges_found, consistency.edges_by_chance
     if share is None or chance is None:
         return False
-    return (share - chance) / (1.0 - min(chance, 0.95)) < (options or CoverageOptions()).hidden_edges
+    return (share - chance) / (1.0 - min(chance, 0.95)) < HIDDEN_EDGES
 
 
 def with_hidden(record: ComponentDeviation) -> ComponentDeviation:
@@ -64,12 +64,12 @@ def with_hidden(record: ComponentDeviation) -> ComponentDeviation:
     )
 
 
-def _few(covered: ComponentCoverage, options: CoverageOptions, is_measured: bool) -> str:
+def _few(covered: ComponentCoverage, is_measured: bool) -> str:
     """Why the photos of a component are too few; empty if they are not."""
     photos = len(covered.photos)
     if photos == 0:
         return "no photo shows enough of it: other components hide it, or it is outside the pictures"
-    if photos >= options.photos_wanted and covered.directions >= options.directions_wanted:
+    if photos >= PHOTOS_WANTED and covered.directions >= DIRECTIONS_WANTED:
         return ""
     places = f"{covered.directions} direction{'s' * (covered.directions != 1)}"
     text = f"only {photos} photo{'s' * (photos != 1)} from {places} show{'s' * (photos == 1)} it"

@@ -62,9 +62,19 @@ class DisplacedGhosts:
         line = np.array([[*(0.75 * np.array(self.color) + 0.25 * 255), 1.0]], dtype=np.float32)
         patterns = np.array([PLAIN], dtype=np.int8)
         blend(
-            image, moved.u0, moved.v0, moved.face_ids, moved.shade, moved.components, style, cover, owner, line,
-            patterns, 1,
-        )  # fmt: skip
+            image,
+            moved.u0,
+            moved.v0,
+            face_ids=moved.face_ids,
+            shade=moved.shade,
+            components=moved.components,
+            ghost_style=style,
+            edge_cover=cover,
+            edge_owner=owner,
+            edge_style=line,
+            patterns=patterns,
+            hatch_px=1,
+        )
 
     def _hide(self, view: GhostView, index: int, moved: GhostView, cover: NDArray[np.uint8]) -> None:
         """Remove, in place, what other components hide; a component does not hide itself at its nominal place."""

@@ -92,18 +92,34 @@ class Edges:
             dashed = np.zeros(self._components, dtype=np.bool_)
         dash_px = round(2.0 + 3.0 * width_px)
         _draw_edges(
-            points, self._ends, self._faces, self._is_crease, self._is_closed, self._owner,
-            self._normals, self._face_points, eye_in_model,
-            camera.fx, camera.fy, camera.cx - view.u0, camera.cy - view.v0,
-            view.inverse_depth, width_px, with_hidden, dashed, dash_px, cover, owner,
-        )  # fmt: skip
+            points,
+            self._ends,
+            self._faces,
+            is_crease=self._is_crease,
+            is_closed=self._is_closed,
+            owners=self._owner,
+            normals=self._normals,
+            face_points=self._face_points,
+            eye=eye_in_model,
+            fx=camera.fx,
+            fy=camera.fy,
+            cx=camera.cx - view.u0,
+            cy=camera.cy - view.v0,
+            inverse_depth=view.inverse_depth,
+            width_px=width_px,
+            with_hidden=with_hidden,
+            dashed=dashed,
+            dash_px=dash_px,
+            cover=cover,
+            owner=owner,
+        )
         return cover, owner
 
 
 @kernel(fastmath=True)
 def _faces_camera(
     normals: NDArray[np.float64], face_points: NDArray[np.float64], eye: NDArray[np.float64], face: int
-) -> bool:  # fmt: skip
+) -> bool:
     return (
         normals[face, 0] * (eye[0] - face_points[face, 0])
         + normals[face, 1] * (eye[1] - face_points[face, 1])

@@ -95,9 +95,17 @@ class Ghost:
         faces, components, count = _faces_to_draw(points, self._faces, self._winding, self._component_of_face, shade)
         u0, v0, u1, v1 = window if self._ideal_pixels is None else self._ideal_window(self._ideal_pixels, window)
         inverse_depth, face_ids = rasterise(
-            points, faces[:count], camera.fx, camera.fy, camera.cx, camera.cy,
-            u1 - u0, v1 - v0, NEAR_MM, (u0, v0),
-        )  # fmt: skip
+            points,
+            faces[:count],
+            camera.fx,
+            fy=camera.fy,
+            cx=camera.cx,
+            cy=camera.cy,
+            width=u1 - u0,
+            height=v1 - v0,
+            near_mm=NEAR_MM,
+            origin=(u0, v0),
+        )
         if self._ideal_pixels is not None:
             inverse_depth, face_ids = _look_up(self._ideal_pixels, window, (u0, v0), inverse_depth, face_ids)
         return GhostView(window[0], window[1], inverse_depth, face_ids, shade[:count], components[:count])
@@ -187,9 +195,12 @@ def _ideal_pixels(camera: Camera) -> NDArray[np.int16]:
 
 @kernel
 def _look_up(
-    ideal_pixels: NDArray[np.int16], window: tuple[int, ...], origin: tuple[int, int],
-    inverse_depth: NDArray[np.float64], face_ids: NDArray[np.int32]
-) -> tuple[NDArray[np.float64], NDArray[np.int32]]:  # fmt: skip
+    ideal_pixels: NDArray[np.int16],
+    window: tuple[int, ...],
+    origin: tuple[int, int],
+    inverse_depth: NDArray[np.float64],
+    face_ids: NDArray[np.int32],
+) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
     """Inverse depth and faces of a window of the real image, from those of the ideal image."""
     u0, v0, u1, v1 = window
     depth = np.zeros((v1 - v0, u1 - u0))
@@ -206,9 +217,12 @@ def _look_up(
 
 @kernel(fastmath=True)
 def _faces_to_draw(
-    points: NDArray[np.float64], faces: NDArray[np.int32], winding: NDArray[np.int8],
-    component_of_face: NDArray[np.int32], shade: NDArray[np.float32]
-) -> tuple[NDArray[np.int32], NDArray[np.int32], int]:  # fmt: skip
+    points: NDArray[np.float64],
+    faces: NDArray[np.int32],
+    winding: NDArray[np.int8],
+    component_of_face: NDArray[np.int32],
+    shade: NDArray[np.float32],
+) -> tuple[NDArray[np.int32], NDArray[np.int32], int]:
     """Faces that may be visible (first ``count`` rows), their components, and ``count``; fills ``shade``."""
     kept = np.empty_like(faces)
     components = np.empty_like(component_of_face)
@@ -232,10 +246,19 @@ def _faces_to_draw(
 
 @kernel(fastmath=True)
 def blend(
-    image: NDArray[np.uint8], u0: int, v0: int, face_ids: NDArray[np.int32], shade: NDArray[np.float32],
-    components: NDArray[np.int32], ghost_style: NDArray[np.float32], edge_cover: NDArray[np.uint8],
-    edge_owner: NDArray[np.int16], edge_style: NDArray[np.float32], patterns: NDArray[np.int8], hatch_px: int
-) -> None:  # fmt: skip
+    image: NDArray[np.uint8],
+    u0: int,
+    v0: int,
+    face_ids: NDArray[np.int32],
+    shade: NDArray[np.float32],
+    components: NDArray[np.int32],
+    ghost_style: NDArray[np.float32],
+    edge_cover: NDArray[np.uint8],
+    edge_owner: NDArray[np.int16],
+    edge_style: NDArray[np.float32],
+    patterns: NDArray[np.int8],
+    hatch_px: int,
+) -> None:
     """Blend ghost and edges over the image in place.
 
     ``ghost_style`` and ``edge_style`` are (C,4) float32: r, g, b in 0–255 and alpha in 0–1 of each component;
@@ -284,9 +307,14 @@ def blend(
 
 @kernel
 def count_cells(
-    u0: int, v0: int, face_ids: NDArray[np.int32], components: NDArray[np.int32], weight: NDArray[np.float32],
-    cells: NDArray[np.float32], seen_px: NDArray[np.int64]
-) -> None:  # fmt: skip
+    u0: int,
+    v0: int,
+    face_ids: NDArray[np.int32],
+    components: NDArray[np.int32],
+    weight: NDArray[np.float32],
+    cells: NDArray[np.float32],
+    seen_px: NDArray[np.int64],
+) -> None:
     """Add the weighted area (``weight`` (C,) times pixels) to each cell, and the visible pixels to each component.
 
     Every second pixel of every second row is counted as four.

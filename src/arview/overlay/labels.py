@@ -18,7 +18,7 @@ from arview.geometry import Array, apply
 from arview.inspection import ComponentDeviation, Finding, Inspection, Verdict
 from arview.inspection.rounding import decimals_of
 from arview.overlay.evidence import DISPLACED_RGB, MISSING_RGB, DrawnEvidence, dimmed, evidence_of
-from arview.overlay.options import NEUTRAL_RGB, VERDICT_RGB, VERDICT_WORD, OverlayOptions, Rgb
+from arview.overlay.options import DECIMALS, NEUTRAL_RGB, UNIT, VERDICT_RGB, VERDICT_WORD, OverlayOptions, Rgb
 from arview.pose import ComponentPresence
 
 _MM_PER_UNIT = {"mm": 1.0, "inch": 25.4}
@@ -42,12 +42,12 @@ _ARROW_FRACTION = 0.14
 """Length of the longest arrow, at most, in diameters of the part."""
 
 
-def _number(value_mm: float, options: OverlayOptions, signed: bool = False, uncertainty_mm: float | None = None) -> str:
+def _number(value_mm: float, signed: bool = False, uncertainty_mm: float | None = None) -> str:
     """A length in the unit of the labels, with a typographic minus sign and no more decimals than U allows."""
-    decimals = options.decimals
+    decimals = DECIMALS
     if uncertainty_mm:
-        decimals = min(decimals, decimals_of(uncertainty_mm / _MM_PER_UNIT[options.unit]))
-    value = value_mm / _MM_PER_UNIT[options.unit]
+        decimals = min(decimals, decimals_of(uncertainty_mm / _MM_PER_UNIT[UNIT]))
+    value = value_mm / _MM_PER_UNIT[UNIT]
     sign = "+" if signed else ""
     return f"{value:{sign}.{decimals}f}".replace("-", "−")
 
@@ -80,16 +80,16 @@ def label_order(names: Iterable[str], inspection: Inspection | None, pending: Co
     return [*urgent, *open_names, *(one.name for one in measured if one.name not in urgent)]
 
 
-def value_text(deviation: ComponentDeviation, options: OverlayOptions) -> str:
+def value_text(deviation: ComponentDeviation) -> str:
     """The distance with its unit, ``missing``, ``undetermined``, or an empty text if nothing was measured."""
     if deviation.finding is Finding.MISSING:
         return "missing"
     if deviation.distance_mm is None:
         return "" if deviation.verdict is Verdict.NOT_MEASURED else "undetermined"
-    return _number(deviation.distance_mm, options, uncertainty_mm=deviation.uncertainty_mm) + _UNIT_SUFFIX[options.unit]
+    return _number(deviation.distance_mm, uncertainty_mm=deviation.uncertainty_mm) + _UNIT_SUFFIX[UNIT]
 
 
-def detail_parts(deviation: ComponentDeviation, options: OverlayOptions) -> tuple[str, ...]:
+def detail_parts(deviation: ComponentDeviation) -> tuple[str, ...]:
     """Displacement per axis, rotation and U, as texts that must not be broken; axes within U of zero are left out.
 
     Undetermined axes are shown with a question mark.
@@ -102,19 +102,19 @@ def detail_parts(deviation: ComponentDeviation, options: OverlayOptions) -> tupl
         if value is None:
             shown.append(f"d{axis} ?")
         elif abs(value) > uncertainty_mm:
-            shown.append(f"d{axis} {_number(value, options, True, uncertainty_mm)}")
+            shown.append(f"d{axis} {_number(value, True, uncertainty_mm)}")
     parts = list(shown)
     if deviation.tilt_deg is not None and deviation.tilt_deg >= 0.1:
         parts.append(f"tilt {deviation.tilt_deg:.1f}°")
     if deviation.twist_deg is not None and abs(deviation.twist_deg) >= 0.1:
         parts.append(f"twist {deviation.twist_deg:+.1f}°".replace("-", "−"))
-    parts.append(f"U {_number(uncertainty_mm, options, uncertainty_mm=uncertainty_mm)}")
+    parts.append(f"U {_number(uncertainty_mm, uncertainty_mm=uncertainty_mm)}")
     return tuple(parts)
 
 
-def detail_text(deviation: ComponentDeviation, options: OverlayOptions) -> str:
+def detail_text(deviation: ComponentDeviation) -> str:
     """The parts of `detail_parts` in one line, the axes closer together than the others."""
-    parts = detail_parts(deviation, options)
+    parts = detail_parts(deviation)
     axes = "  ".join(part for part in parts if part.startswith("d"))
     return "   ".join([*([axes] if axes else []), *(part for part in parts if not part.startswith("d"))])
 
@@ -241,7 +241,7 @@ def label_text(
         word = {DrawnEvidence.UNVERIFIED: "NOT VERIFIED", DrawnEvidence.UNCERTAIN: "UNCERTAIN"}.get(evidence, seen)
         value = MEASURING if is_pending else ""
         return LabelText(name, value, word, _with((), note), evidence=evidence, is_dimmed=evidence.is_open)
-    value, word, verdict = value_text(deviation, options), VERDICT_WORD[deviation.verdict], deviation.verdict
+    value, word, verdict = value_text(deviation), VERDICT_WORD[deviation.verdict], deviation.verdict
     is_measured = verdict is not Verdict.NOT_MEASURED
     remark = ""
     if evidence.is_open:
@@ -251,8 +251,10 @@ def label_text(
         remark = f"seen now: {CHANGED}"
     notes = _with((), remark, doubt, note)
     is_dimmed = bool(remark or doubt)
-    details = () if notes or verdict is Verdict.PASS else detail_parts(deviation, options)
-    return LabelText(name, value, word, notes, details, verdict, evidence, is_dimmed)
+    details = () if notes or verdict is Verdict.PASS else detail_parts(deviation)
+    return LabelText(
+        name, value, word, notes=notes, details=details, verdict=verdict, evidence=evidence, is_dimmed=is_dimmed
+    )
 
 
 def displacement_texts(
@@ -265,8 +267,8 @@ def displacement_texts(
     distance = float(np.linalg.norm(apply(moved, center_in_model[None])[0] - center_in_model))
     cosine = min(1.0, max(-1.0, 0.5 * (float(np.trace(moved[:3, :3])) - 1.0)))
     turn_deg = math.degrees(math.acos(cosine))
-    digits = (2 if options.unit == "inch" else 1) if distance < 10.0 else (1 if options.unit == "inch" else 0)
-    away = f"≈ {distance / _MM_PER_UNIT[options.unit]:.{digits}f}{_UNIT_SUFFIX[options.unit]} away"
+    digits = (2 if UNIT == "inch" else 1) if distance < 10.0 else (1 if UNIT == "inch" else 0)
+    away = f"≈ {distance / _MM_PER_UNIT[UNIT]:.{digits}f}{_UNIT_SUFFIX[UNIT]} away"
     return away, (f"turned {turn_deg:.0f}°",) if turn_deg >= _MIN_TURN_DEG else ()
 
 

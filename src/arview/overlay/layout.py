@@ -440,10 +440,17 @@ def _integral(cells: NDArray[np.float32], anchors: NDArray[np.float64], area: fl
 
 @kernel
 def _best_rows(
-    rows: NDArray[np.float64], heights: NDArray[np.float64], gap: int, bottom: int, x0: NDArray[np.float64],
-    widths: NDArray[np.float64], anchors: NDArray[np.float64], previous: NDArray[np.float64],
-    integral: NDArray[np.float64], cover_cost: float
-) -> NDArray[np.float64]:  # fmt: skip
+    rows: NDArray[np.float64],
+    heights: NDArray[np.float64],
+    gap: int,
+    bottom: int,
+    x0: NDArray[np.float64],
+    widths: NDArray[np.float64],
+    anchors: NDArray[np.float64],
+    previous: NDArray[np.float64],
+    integral: NDArray[np.float64],
+    cover_cost: float,
+) -> NDArray[np.float64]:
     """Rows (N,) of the labels of a column, in order and without overlap, of least total cost (dynamic programming).
 
     ``heights`` include the gap below. The costs of a label are for the area that it covers, its squared distance from

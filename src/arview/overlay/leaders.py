@@ -57,7 +57,7 @@ def leader_points(
     """Points of a leader from a box (x, y, width, height): sideways with a short stub, else from its top or bottom."""
     x, y, width, height = box
     u, v = float(anchor[0]), float(anchor[1])
-    px, py, bend = _port(x, y, width, height, 1 if is_right else 0, u, v, stub_px)
+    px, py, bend = _port(x, y, width, height=height, side=1 if is_right else 0, u=u, v=v, stub=stub_px)
     return [(px, py), (u, v)] if bend == px else [(px, py), (bend, py), (u, v)]
 
 
@@ -85,7 +85,9 @@ def uncrossed(
     sides, y = places.sides.copy(), places.y.astype(np.float64)
     old = np.stack([sides.astype(np.float64), y, places.inertia], axis=1)
     bounds = np.array([gap_px, stub_px, rows[-1], width_px], dtype=np.float64)
-    _search(places.x, places.sizes, places.anchors, sides, y, old, rows, bounds, integral)
+    _search(
+        places.x, places.sizes, places.anchors, sides=sides, y=y, old=old, rows=rows, bounds=bounds, integral=integral
+    )
     return replace(places, sides=sides, y=y)
 
 
@@ -112,9 +114,7 @@ def _side_of(ax: float, ay: float, bx: float, by: float, cx: float, cy: float) -
 
 
 @kernel
-def _meet(
-    ax: float, ay: float, bx: float, by: float, cx: float, cy: float, dx: float, dy: float
-) -> bool:  # fmt: skip
+def _meet(ax: float, ay: float, bx: float, by: float, cx: float, cy: float, dx: float, dy: float) -> bool:
     """Whether two segments cross, apart from common ends."""
     if max(ax, bx) < min(cx, dx) or max(cx, dx) < min(ax, bx) or max(ay, by) < min(cy, dy) or max(cy, dy) < min(ay, by):
         return False
@@ -124,9 +124,7 @@ def _meet(
 
 
 @kernel
-def _enters(
-    ax: float, ay: float, bx: float, by: float, x: float, y: float, width: float, height: float
-) -> bool:  # fmt: skip
+def _enters(ax: float, ay: float, bx: float, by: float, x: float, y: float, width: float, height: float) -> bool:
     """Whether a segment enters a box (Liang and Barsky, "A new concept and method for line clipping", 1984)."""
     low, high = 0.0, 1.0
     for axis in range(2):
@@ -145,29 +143,56 @@ def _enters(
 
 @kernel
 def _pair_crossings(
-    xi: float, yi: float, wi: float, hi: float, si: int, ui: float, vi: float,
-    xj: float, yj: float, wj: float, hj: float, sj: int, uj: float, vj: float, stub: float
-) -> tuple[int, int, int]:  # fmt: skip
+    xi: float,
+    yi: float,
+    wi: float,
+    hi: float,
+    si: int,
+    ui: float,
+    vi: float,
+    xj: float,
+    yj: float,
+    wj: float,
+    hj: float,
+    sj: int,
+    uj: float,
+    vj: float,
+    stub: float,
+) -> tuple[int, int, int]:
     """Crossings of leader i with leader j, of leader i with box j and of leader j with box i."""
-    pi, qi, bi = _port(xi, yi, wi, hi, si, ui, vi, stub)
-    pj, qj, bj = _port(xj, yj, wj, hj, sj, uj, vj, stub)
+    pi, qi, bi = _port(xi, yi, wi, height=hi, side=si, u=ui, v=vi, stub=stub)
+    pj, qj, bj = _port(xj, yj, wj, height=hj, side=sj, u=uj, v=vj, stub=stub)
     leaders = 0
     if (
-        _meet(bi, qi, ui, vi, bj, qj, uj, vj)
-        or _meet(pi, qi, bi, qi, bj, qj, uj, vj)
-        or _meet(bi, qi, ui, vi, pj, qj, bj, qj)
+        _meet(bi, qi, ui, by=vi, cx=bj, cy=qj, dx=uj, dy=vj)
+        or _meet(pi, qi, bi, by=qi, cx=bj, cy=qj, dx=uj, dy=vj)
+        or _meet(bi, qi, ui, by=vi, cx=pj, cy=qj, dx=bj, dy=qj)
     ):
         leaders = 1
-    i_in_j = 1 if _enters(bi, qi, ui, vi, xj, yj, wj, hj) or _enters(pi, qi, bi, qi, xj, yj, wj, hj) else 0
-    j_in_i = 1 if _enters(bj, qj, uj, vj, xi, yi, wi, hi) or _enters(pj, qj, bj, qj, xi, yi, wi, hi) else 0
+    i_in_j = (
+        1
+        if _enters(bi, qi, ui, by=vi, x=xj, y=yj, width=wj, height=hj)
+        or _enters(pi, qi, bi, by=qi, x=xj, y=yj, width=wj, height=hj)
+        else 0
+    )
+    j_in_i = (
+        1
+        if _enters(bj, qj, uj, by=vj, x=xi, y=yi, width=wi, height=hi)
+        or _enters(pj, qj, bj, by=qj, x=xi, y=yi, width=wi, height=hi)
+        else 0
+    )
     return leaders, i_in_j, j_in_i
 
 
 @kernel
 def _crossings(
-    x: NDArray[np.float64], sizes: NDArray[np.float64], anchors: NDArray[np.float64], sides: NDArray[np.int64],
-    y: NDArray[np.float64], stub: float
-) -> NDArray[np.int64]:  # fmt: skip
+    x: NDArray[np.float64],
+    sizes: NDArray[np.float64],
+    anchors: NDArray[np.float64],
+    sides: NDArray[np.int64],
+    y: NDArray[np.float64],
+    stub: float,
+) -> NDArray[np.int64]:
     count = len(y)
     result = np.zeros((count, count), dtype=np.int64)
     for i in range(count):
@@ -176,9 +201,22 @@ def _crossings(
             result[i, i] = 1
         for j in range(i):
             leaders, i_in_j, j_in_i = _pair_crossings(
-                xi, y[i], wi, hi, sides[i], anchors[i, 0], anchors[i, 1],
-                x[j, sides[j]], y[j], sizes[j, 0], sizes[j, 1], sides[j], anchors[j, 0], anchors[j, 1], stub,
-            )  # fmt: skip
+                xi,
+                y[i],
+                wi,
+                hi=hi,
+                si=sides[i],
+                ui=anchors[i, 0],
+                vi=anchors[i, 1],
+                xj=x[j, sides[j]],
+                yj=y[j],
+                wj=sizes[j, 0],
+                hj=sizes[j, 1],
+                sj=sides[j],
+                uj=anchors[j, 0],
+                vj=anchors[j, 1],
+                stub=stub,
+            )
             if (
                 xi < x[j, sides[j]] + sizes[j, 0]
                 and x[j, sides[j]] < xi + wi
@@ -193,10 +231,19 @@ def _crossings(
 
 @kernel
 def _cost(
-    i: int, side: int, top: float, x: NDArray[np.float64], sizes: NDArray[np.float64], anchors: NDArray[np.float64],
-    sides: NDArray[np.int64], y: NDArray[np.float64], is_on: NDArray[np.bool_], old: NDArray[np.float64],
-    bounds: NDArray[np.float64], integral: NDArray[np.float64]
-) -> float:  # fmt: skip
+    i: int,
+    side: int,
+    top: float,
+    x: NDArray[np.float64],
+    sizes: NDArray[np.float64],
+    anchors: NDArray[np.float64],
+    sides: NDArray[np.int64],
+    y: NDArray[np.float64],
+    is_on: NDArray[np.bool_],
+    old: NDArray[np.float64],
+    bounds: NDArray[np.float64],
+    integral: NDArray[np.float64],
+) -> float:
     """Cost of a place of label i beside the others that are on; infinite if it overlaps one.
 
     ``old`` (N,3): side and top before the search, and inertia. ``bounds``: gap, stub, bottom, width of the image.
@@ -212,7 +259,21 @@ def _cost(
         if xi < xj + wj and xj < xi + wi and top < y[j] + hj + gap and y[j] < top + hi + gap:
             return np.inf
         leaders, i_in_j, j_in_i = _pair_crossings(
-            xi, top, wi, hi, side, u, v, xj, y[j], wj, hj, sides[j], anchors[j, 0], anchors[j, 1], stub
+            xi,
+            top,
+            wi,
+            hi=hi,
+            si=side,
+            ui=u,
+            vi=v,
+            xj=xj,
+            yj=y[j],
+            wj=wj,
+            hj=hj,
+            sj=sides[j],
+            uj=anchors[j, 0],
+            vj=anchors[j, 1],
+            stub=stub,
         )
         total += leaders + i_in_j + j_in_i
     if xi < u < xi + wi and top < v < top + hi:
@@ -232,17 +293,38 @@ def _cost(
 
 @kernel
 def _best_place(
-    i: int, x: NDArray[np.float64], sizes: NDArray[np.float64], anchors: NDArray[np.float64],
-    sides: NDArray[np.int64], y: NDArray[np.float64], is_on: NDArray[np.bool_], old: NDArray[np.float64],
-    rows: NDArray[np.float64], bounds: NDArray[np.float64], integral: NDArray[np.float64]
-) -> tuple[float, int, float]:  # fmt: skip
+    i: int,
+    x: NDArray[np.float64],
+    sizes: NDArray[np.float64],
+    anchors: NDArray[np.float64],
+    sides: NDArray[np.int64],
+    y: NDArray[np.float64],
+    is_on: NDArray[np.bool_],
+    old: NDArray[np.float64],
+    rows: NDArray[np.float64],
+    bounds: NDArray[np.float64],
+    integral: NDArray[np.float64],
+) -> tuple[float, int, float]:
     """Least cost of label i over all places, and that place."""
     best, best_side, best_y = np.inf, sides[i], y[i]
     for side in range(2):
         for k in range(len(rows)):
             if rows[k] + sizes[i, 1] > bounds[2]:
                 break
-            cost = _cost(i, side, rows[k], x, sizes, anchors, sides, y, is_on, old, bounds, integral)
+            cost = _cost(
+                i,
+                side,
+                rows[k],
+                x=x,
+                sizes=sizes,
+                anchors=anchors,
+                sides=sides,
+                y=y,
+                is_on=is_on,
+                old=old,
+                bounds=bounds,
+                integral=integral,
+            )
             if cost < best:
                 best, best_side, best_y = cost, side, rows[k]
     return best, best_side, best_y
@@ -250,18 +332,77 @@ def _best_place(
 
 @kernel
 def _place_both(
-    i: int, j: int, x: NDArray[np.float64], sizes: NDArray[np.float64], anchors: NDArray[np.float64],
-    sides: NDArray[np.int64], y: NDArray[np.float64], is_on: NDArray[np.bool_], old: NDArray[np.float64],
-    rows: NDArray[np.float64], bounds: NDArray[np.float64], integral: NDArray[np.float64]
-) -> bool:  # fmt: skip
+    i: int,
+    j: int,
+    x: NDArray[np.float64],
+    sizes: NDArray[np.float64],
+    anchors: NDArray[np.float64],
+    sides: NDArray[np.int64],
+    y: NDArray[np.float64],
+    is_on: NDArray[np.bool_],
+    old: NDArray[np.float64],
+    rows: NDArray[np.float64],
+    bounds: NDArray[np.float64],
+    integral: NDArray[np.float64],
+) -> bool:
     """Take labels i and j off and place first i, then j, where that is better; returns whether it was."""
     side_i, y_i, side_j, y_j = sides[i], y[i], sides[j], y[j]
-    before = _cost(j, side_j, y_j, x, sizes, anchors, sides, y, is_on, old, bounds, integral)
+    before = _cost(
+        j,
+        side_j,
+        y_j,
+        x=x,
+        sizes=sizes,
+        anchors=anchors,
+        sides=sides,
+        y=y,
+        is_on=is_on,
+        old=old,
+        bounds=bounds,
+        integral=integral,
+    )
     is_on[j] = False
-    before += _cost(i, side_i, y_i, x, sizes, anchors, sides, y, is_on, old, bounds, integral)
-    first, sides[i], y[i] = _best_place(i, x, sizes, anchors, sides, y, is_on, old, rows, bounds, integral)
+    before += _cost(
+        i,
+        side_i,
+        y_i,
+        x=x,
+        sizes=sizes,
+        anchors=anchors,
+        sides=sides,
+        y=y,
+        is_on=is_on,
+        old=old,
+        bounds=bounds,
+        integral=integral,
+    )
+    first, sides[i], y[i] = _best_place(
+        i,
+        x,
+        sizes,
+        anchors=anchors,
+        sides=sides,
+        y=y,
+        is_on=is_on,
+        old=old,
+        rows=rows,
+        bounds=bounds,
+        integral=integral,
+    )
     is_on[j] = True
-    second, sides[j], y[j] = _best_place(j, x, sizes, anchors, sides, y, is_on, old, rows, bounds, integral)
+    second, sides[j], y[j] = _best_place(
+        j,
+        x,
+        sizes,
+        anchors=anchors,
+        sides=sides,
+        y=y,
+        is_on=is_on,
+        old=old,
+        rows=rows,
+        bounds=bounds,
+        integral=integral,
+    )
     if first + second < before - 1e-6:
         return True
     sides[i], y[i], sides[j], y[j] = side_i, y_i, side_j, y_j
@@ -270,10 +411,16 @@ def _place_both(
 
 @kernel
 def _search(
-    x: NDArray[np.float64], sizes: NDArray[np.float64], anchors: NDArray[np.float64], sides: NDArray[np.int64],
-    y: NDArray[np.float64], old: NDArray[np.float64], rows: NDArray[np.float64], bounds: NDArray[np.float64],
-    integral: NDArray[np.float64]
-) -> None:  # fmt: skip
+    x: NDArray[np.float64],
+    sizes: NDArray[np.float64],
+    anchors: NDArray[np.float64],
+    sides: NDArray[np.int64],
+    y: NDArray[np.float64],
+    old: NDArray[np.float64],
+    rows: NDArray[np.float64],
+    bounds: NDArray[np.float64],
+    integral: NDArray[np.float64],
+) -> None:
     """Improve sides and tops in place until nothing crosses or no move of one or two labels helps."""
     count = len(y)
     is_on = np.ones(count, dtype=np.bool_)
@@ -285,16 +432,56 @@ def _search(
         for i in range(count):
             if crossings[i].sum() + crossings[:, i].sum() == 0:
                 continue
-            now = _cost(i, sides[i], y[i], x, sizes, anchors, sides, y, is_on, old, bounds, integral)
-            cost, side, top = _best_place(i, x, sizes, anchors, sides, y, is_on, old, rows, bounds, integral)
+            now = _cost(
+                i,
+                sides[i],
+                y[i],
+                x=x,
+                sizes=sizes,
+                anchors=anchors,
+                sides=sides,
+                y=y,
+                is_on=is_on,
+                old=old,
+                bounds=bounds,
+                integral=integral,
+            )
+            cost, side, top = _best_place(
+                i,
+                x,
+                sizes,
+                anchors=anchors,
+                sides=sides,
+                y=y,
+                is_on=is_on,
+                old=old,
+                rows=rows,
+                bounds=bounds,
+                integral=integral,
+            )
             if cost < now - 1e-6:
                 sides[i], y[i] = side, top
                 has_improved = True
         for i in range(count):
             for j in range(count):
-                if i != j and crossings[i, j] + crossings[j, i] > 0 and _place_both(
-                    i, j, x, sizes, anchors, sides, y, is_on, old, rows, bounds, integral
-                ):  # fmt: skip
+                if (
+                    i != j
+                    and crossings[i, j] + crossings[j, i] > 0
+                    and _place_both(
+                        i,
+                        j,
+                        x,
+                        sizes=sizes,
+                        anchors=anchors,
+                        sides=sides,
+                        y=y,
+                        is_on=is_on,
+                        old=old,
+                        rows=rows,
+                        bounds=bounds,
+                        integral=integral,
+                    )
+                ):
                     has_improved = True
         if not has_improved:
             return

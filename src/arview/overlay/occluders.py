@@ -13,7 +13,6 @@ surface was seen, or of its colour throughout, are not found.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -54,61 +53,53 @@ _MIN_AGREEING = 0.1
 """Share of the samples that must agree on the exposure; with fewer it is taken to be as before."""
 
 
-@dataclass(frozen=True)
-class OccluderOptions:
-    """How occluders are found.
-
-    Attributes:
-        cells: of the grid along the longest side of the part.
-        samples: pixels that are compared in a frame, about.
-        min_observations: frames in which a cell was seen before it is compared.
-        hue_noise: standard deviation, in grey levels, of a colour of the same brightness, apart from what a cell shows.
-        noise: the same of the brightness.
-        shade, shine: factors of the brightness between which shading, shadows and reflections explain a difference.
-        max_variance: of hue and brightness in a cell, squared grey levels; more would make it blind.
-        min_score: squared normalised difference of colours from which on a pixel looks like an occluder.
-        sure_score: the same of pixels of which every occluder must have some.
-        min_contrast: standard deviation, among neighbours, of the logarithm of seen to expected brightness from which
-            on there is an edge that the surface does not have.
-        min_share: share of neighbours that must look so, too.
-        min_samples: samples of an occluder, at least.
-        min_sure_share: share of them that must be sure.
-        reach: distance, in samples, up to which an occluder is extended to its outline.
-        min_mismatch: root mean square of the logarithm of seen to expected colour in a gap of an occluder, in standard
-            deviations of the surface, from which on the gap belongs to it: the surface between two fingers agrees.
-        min_surface_noise: the least such standard deviation.
-        rate: weight of a new colour in a cell that was seen often.
-        occluded_rate: the same where an occluder was found: what stays is learned in the end.
-    """
-
-    cells: int = 72
-    samples: int = 9000
-    min_observations: int = 6
-    hue_noise: float = 4.0
-    noise: float = 8.0
-    shade: float = 0.85
-    shine: float = 1.25
-    max_variance: float = 150.0
-    min_score: float = 1.0
-    sure_score: float = 6.0
-    min_contrast: float = 0.25
-    min_share: float = 0.6
-    min_samples: int = 10
-    min_sure_share: float = 0.15
-    reach: int = 6
-    min_mismatch: float = 2.5
-    min_surface_noise: float = 0.02
-    rate: float = 0.04
-    occluded_rate: float = 0.002
+CELLS = 72
+"""Of the grid along the longest side of the part."""
+SAMPLES = 9000
+"""Pixels that are compared in a frame, about."""
+MIN_OBSERVATIONS = 6
+"""Frames in which a cell was seen before it is compared."""
+HUE_NOISE = 4.0
+"""Standard deviation, in grey levels, of a colour of the same brightness, apart from what a cell shows."""
+NOISE = 8.0
+"""The same of the brightness."""
+SHADE = 0.85
+SHINE = 1.25
+"""Factors of the brightness between which shading, shadows and reflections explain a difference."""
+MAX_VARIANCE = 150.0
+"""Of hue and brightness in a cell, squared grey levels; more would make it blind."""
+MIN_SCORE = 1.0
+"""Squared normalised difference of colours from which on a pixel looks like an occluder."""
+SURE_SCORE = 6.0
+"""The same of pixels of which every occluder must have some."""
+MIN_CONTRAST = 0.25
+"""Standard deviation, among neighbours, of the logarithm of seen to expected brightness from which on there is an edge
+that the surface does not have."""
+MIN_SHARE = 0.6
+"""Share of neighbours that must look so, too."""
+MIN_SAMPLES = 10
+"""Samples of an occluder, at least."""
+MIN_SURE_SHARE = 0.15
+"""Share of them that must be sure."""
+REACH = 6
+"""Distance, in samples, up to which an occluder is extended to its outline."""
+MIN_MISMATCH = 2.5
+"""Root mean square of the logarithm of seen to expected colour in a gap of an occluder, in standard deviations of the
+surface, from which on the gap belongs to it: the surface between two fingers agrees."""
+MIN_SURFACE_NOISE = 0.02
+"""The least such standard deviation."""
+RATE = 0.04
+"""Weight of a new colour in a cell that was seen often."""
+OCCLUDED_RATE = 0.002
+"""The same where an occluder was found: what stays is learned in the end."""
 
 
 class OccluderFinder:
     """Finds occluders in the frames of one video; see the module."""
 
-    def __init__(self, model: Model, camera: Camera, options: OccluderOptions | None = None) -> None:
-        self._options = options or OccluderOptions()
+    def __init__(self, model: Model, camera: Camera) -> None:
         low, high = model.bounds_in_model
-        self._cell_mm = float((high - low).max()) / self._options.cells
+        self._cell_mm = float((high - low).max()) / CELLS
         self._origin = low - 0.5 * self._cell_mm
         shape = np.ceil((high - low) / self._cell_mm).astype(np.int64) + 2
         # Mean red, green and blue, variances of hue and brightness, and the number of observations.
@@ -135,22 +126,32 @@ class OccluderFinder:
             learns: whether the pose is sure enough for the colours to be learned.
             skipped: (C,) components that are not there, so that nothing can lie before them.
         """
-        options = self._options
-        finest = float(np.sqrt(view.face_ids.size / options.samples))
+        finest = float(np.sqrt(view.face_ids.size / SAMPLES))
         step = next((one for one in _STEPS if one >= finest), _STEPS[-1])
         rays = self._ray_grid(step)
         skipped = np.zeros(self._components, dtype=np.bool_) if skipped is None else skipped
         cells, observed = _sample(
-            image, view.u0, view.v0, view.face_ids, view.components, skipped, view.inverse_depth, rays, step,
-            invert(cam_from_model), self._origin, self._cell_mm, np.array(self._cells.shape[:3]),
-        )  # fmt: skip
+            image,
+            view.u0,
+            view.v0,
+            face_ids=view.face_ids,
+            components=view.components,
+            skipped=skipped,
+            inverse_depth=view.inverse_depth,
+            rays=rays,
+            step=step,
+            model_from_cam=invert(cam_from_model),
+            origin=self._origin,
+            cell_mm=self._cell_mm,
+            shape=np.array(self._cells.shape[:3]),
+        )
         table = self._cells.reshape(-1, _COLUMNS)
-        known = (cells >= 0) & (table[cells, _COUNT] >= options.min_observations)
+        known = (cells >= 0) & (table[cells, _COUNT] >= MIN_OBSERVATIONS)
         rows, columns = cells.shape[0], cells.shape[1]
         mask = strange = np.zeros((rows, columns), dtype=np.uint8)
         gain = self._gain
         compared = np.flatnonzero(known)
-        if len(compared) > 4 * options.min_samples:
+        if len(compared) > 4 * MIN_SAMPLES:
             # A part of the samples is enough for the exposure.
             few = compared[::_EXPOSURE_STRIDE]
             gain = self._gain = _exposure(observed.reshape(-1, 3)[few], table[cells.ravel()[few], :3], self._gain)
@@ -158,7 +159,7 @@ class OccluderFinder:
             if mask.any():
                 mask = self._to_outline(cells, observed, known, gain, strange, mask)
         if learns:
-            rates = np.array([options.rate, options.occluded_rate, options.max_variance], dtype=np.float32)
+            rates = np.array([RATE, OCCLUDED_RATE, MAX_VARIANCE], dtype=np.float32)
             _learn(table, cells, observed, gain, mask | strange, rates)
         if not mask.any():
             return None
@@ -189,30 +190,30 @@ class OccluderFinder:
         gain: NDArray[np.float32],
     ) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
         """Samples that look like an occluder by themselves, and those that belong to one."""
-        options, table = self._options, self._cells.reshape(-1, _COLUMNS)
-        noise = np.array([options.hue_noise, options.noise, options.shade, options.shine], dtype=np.float32)
+        table = self._cells.reshape(-1, _COLUMNS)
+        noise = np.array([HUE_NOISE, NOISE, SHADE, SHINE], dtype=np.float32)
         hue, hue_variance, brightness_score, ratio = _differences(table, cells, observed, known, gain, noise)
         # What the frame as a whole differs by, as under another light, is not an occluder. Most of the part may be
         # hidden, so this is judged by the samples that agree best.
         seen = hue[known]
         common = 2.0 * float(np.partition(seen, len(seen) // 5)[len(seen) // 5])
         score = np.maximum(hue / (hue_variance + common), brightness_score)
-        is_strange = known & (score > options.min_score)
+        is_strange = known & (score > MIN_SCORE)
         # Near the surface's own edges and outline a small error of the pose shows the colour of what is beside.
-        is_sure = _sure(table, cells, observed, known & (score > options.sure_score), known, gain, noise)
-        if np.count_nonzero(is_sure) < max(1.0, options.min_sure_share * options.min_samples):
+        is_sure = _sure(table, cells, observed, known & (score > SURE_SCORE), known, gain, noise)
+        if np.count_nonzero(is_sure) < max(1.0, MIN_SURE_SHARE * MIN_SAMPLES):
             return is_strange.astype(np.uint8), np.zeros(cells.shape, dtype=np.uint8)
         is_part, weight = cells >= 0, known.astype(np.float32)
-        is_edge = known & (_local_deviation(ratio, weight) > options.min_contrast)
+        is_edge = known & (_local_deviation(ratio, weight) > MIN_CONTRAST)
         near = cv2.blur((is_strange | is_edge).astype(np.float32), (3, 3)) / np.maximum(cv2.blur(weight, (3, 3)), 1e-3)
-        wide = cv2.morphologyEx(((near >= options.min_share) & is_part).astype(np.uint8), cv2.MORPH_CLOSE, _SQUARE) > 0
+        wide = cv2.morphologyEx(((near >= MIN_SHARE) & is_part).astype(np.uint8), cv2.MORPH_CLOSE, _SQUARE) > 0
         # A deviation reaches one sample beyond the edge that causes it.
         core = cv2.erode((wide | ~is_part).astype(np.uint8), _SQUARE) > 0
         candidate = (wide & is_part & (core | is_strange)).astype(np.uint8)
         count, labels, stats, _ = cv2.connectedComponentsWithStats(candidate, connectivity=8)
         sure = np.bincount(labels[is_sure], minlength=count)
         area = stats[:, cv2.CC_STAT_AREA]
-        kept = (area >= options.min_samples) & (sure >= options.min_sure_share * area)
+        kept = (area >= MIN_SAMPLES) & (sure >= MIN_SURE_SHARE * area)
         kept[0] = False
         return is_strange.astype(np.uint8), kept[labels].astype(np.uint8)
 
@@ -231,12 +232,12 @@ class OccluderFinder:
         a watershed from markers (Meyer, "Color image segmentation", 1992). Gaps that agree with the surface are left
         out.
         """
-        options, is_part = self._options, cells >= 0
+        is_part = cells >= 0
         expected = gain * self._cells.reshape(-1, _COLUMNS)[cells, :3]
         ratio = np.log((observed + _RATIO_OFFSET) / (expected + _RATIO_OFFSET))
         ratio[~known] = 0.0
         levels = np.clip(128.0 + _RATIO_LEVELS * ratio, 0.0, 255.0).astype(np.uint8)
-        side = 2 * options.reach + 1
+        side = 2 * REACH + 1
         near = cv2.dilate(mask, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))) > 0
         is_strange = strange > 0
         markers = np.where(near, 0, _SURFACE).astype(np.int32)
@@ -249,11 +250,11 @@ class OccluderFinder:
         mismatch = (ratio * ratio).max(axis=2)
         around = mismatch[known & ~near]
         noise = 1.48 * float(np.sqrt(np.median(around))) if len(around) else 0.0
-        noise = max(noise, options.min_surface_noise)
+        noise = max(noise, MIN_SURFACE_NOISE)
         gaps = (found & known & ~is_strange).astype(np.uint8)
         count, labels = cv2.connectedComponents(gaps, connectivity=4)
         size = np.maximum(np.bincount(labels.ravel(), minlength=count), 1)
-        agrees = np.bincount(labels.ravel(), mismatch.ravel(), count) / size < (options.min_mismatch * noise) ** 2
+        agrees = np.bincount(labels.ravel(), mismatch.ravel(), count) / size < (MIN_MISMATCH * noise) ** 2
         agrees[0] = False
         return (found & is_part & ~agrees[labels]).astype(np.uint8)
 
@@ -315,10 +316,20 @@ def _exposure(
 
 @kernel
 def _sample(
-    image: NDArray[np.uint8], u0: int, v0: int, face_ids: NDArray[np.int32], components: NDArray[np.int32],
-    skipped: NDArray[np.bool_], inverse_depth: NDArray[np.float64], rays: NDArray[np.float64], step: int,
-    model_from_cam: NDArray[np.float64], origin: NDArray[np.float64], cell_mm: float, shape: NDArray[np.int64]
-) -> tuple[NDArray[np.int64], NDArray[np.float32]]:  # fmt: skip
+    image: NDArray[np.uint8],
+    u0: int,
+    v0: int,
+    face_ids: NDArray[np.int32],
+    components: NDArray[np.int32],
+    skipped: NDArray[np.bool_],
+    inverse_depth: NDArray[np.float64],
+    rays: NDArray[np.float64],
+    step: int,
+    model_from_cam: NDArray[np.float64],
+    origin: NDArray[np.float64],
+    cell_mm: float,
+    shape: NDArray[np.int64],
+) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
     """Cell (R,C) of the model grid that each sample shows, -1 for none, and its mean colour (R,C,3)."""
     height, width = face_ids.shape
     first_row, first_column = v0 // step, u0 // step
@@ -362,9 +373,13 @@ def _sample(
 
 @kernel
 def _differences(
-    table: NDArray[np.float32], cells: NDArray[np.int64], observed: NDArray[np.float32], known: NDArray[np.bool_],
-    gain: NDArray[np.float32], noise: NDArray[np.float32]
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:  # fmt: skip
+    table: NDArray[np.float32],
+    cells: NDArray[np.int64],
+    observed: NDArray[np.float32],
+    known: NDArray[np.bool_],
+    gain: NDArray[np.float32],
+    noise: NDArray[np.float32],
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
     """Squared difference (R,C) of the hue of each sample from its cell, its variance, and the score of the brightness.
 
     The hue is what is left of the colour at the same brightness. ``noise``: of hue and brightness, and the factors
@@ -402,9 +417,14 @@ def _differences(
 
 @kernel
 def _sure(
-    table: NDArray[np.float32], cells: NDArray[np.int64], observed: NDArray[np.float32], strange: NDArray[np.bool_],
-    known: NDArray[np.bool_], gain: NDArray[np.float32], noise: NDArray[np.float32]
-) -> NDArray[np.bool_]:  # fmt: skip
+    table: NDArray[np.float32],
+    cells: NDArray[np.int64],
+    observed: NDArray[np.float32],
+    strange: NDArray[np.bool_],
+    known: NDArray[np.bool_],
+    gain: NDArray[np.float32],
+    noise: NDArray[np.float32],
+) -> NDArray[np.bool_]:
     """Those strange samples (R,C) whose colour is not between the colours expected of their neighbours.
 
     Samples with a neighbour beside the part are none of them. ``noise`` is as in `_differences`.
@@ -434,9 +454,13 @@ def _sure(
 
 @kernel
 def _learn(
-    table: NDArray[np.float32], cells: NDArray[np.int64], observed: NDArray[np.float32], gain: NDArray[np.float32],
-    occluded: NDArray[np.uint8], rates: NDArray[np.float32]
-) -> None:  # fmt: skip
+    table: NDArray[np.float32],
+    cells: NDArray[np.int64],
+    observed: NDArray[np.float32],
+    gain: NDArray[np.float32],
+    occluded: NDArray[np.uint8],
+    rates: NDArray[np.float32],
+) -> None:
     """Update means, variances and counts of the cells, at the exposure that they have.
 
     ``rates``: weight of a new colour in a cell that was seen often, the same of an occluder, and the largest variance.

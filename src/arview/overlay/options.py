@@ -35,6 +35,12 @@ PANEL_RGB: Rgb = (16, 20, 27)
 """Background of labels and of the status line."""
 
 
+UNIT: Unit = "mm"
+"""Of the numbers on labels."""
+DECIMALS = 2
+"""Of the numbers on labels, 0–4."""
+
+
 @dataclass(frozen=True)
 class OverlayOptions:
     """What is drawn, and how.
@@ -44,14 +50,11 @@ class OverlayOptions:
         show_edges: crease and silhouette edges: ``none``, ``visible`` ones, or ``all`` with hidden ones dashed.
         opacity: of the ghost, 0–1; the real part must stay recognisable through it.
         show_labels: draw a label for each component.
-        show_arrows: draw displacements as arrows.
         show_status: draw the status line.
         show_evidence: draw components by what the pictures say of them, see `arview.pose.Presence`; without it all are
             drawn as measured, for pictures that document a measurement.
         show_occlusion: leave ghost and edges out where something is before the part, see `arview.overlay.occluders`.
         show_legend: explain the kinds of evidence that are in the picture.
-        unit: of the numbers on labels.
-        decimals: of the numbers on labels, 0–4.
         arrow_scale: exaggeration of displacements; None: chosen from the largest one.
         max_labels: more would hide the part; failures come first, and those without a label are marked by an arrow.
         text_px: size of the text on labels; None: in proportion to the height of the picture.
@@ -65,13 +68,10 @@ class OverlayOptions:
     show_edges: EdgeMode = "visible"
     opacity: float = 0.42
     show_labels: bool = True
-    show_arrows: bool = True
     show_status: bool = True
     show_evidence: bool = True
     show_occlusion: bool = True
     show_legend: bool = True
-    unit: Unit = "mm"
-    decimals: int = 2
     arrow_scale: float | None = None
     max_labels: int = 12
     text_px: int | None = None
@@ -80,12 +80,12 @@ class OverlayOptions:
     def __post_init__(self) -> None:
         if self.show_edges not in get_args(EdgeMode):
             raise InputError(f"overlay: show_edges is {self.show_edges!r}, expected none, visible or all")
-        if self.unit not in get_args(Unit):
-            raise InputError(f"overlay: unit is {self.unit!r}, expected mm or inch")
+        if UNIT not in get_args(Unit):
+            raise InputError(f"overlay: unit is {UNIT!r}, expected mm or inch")
         if not 0.0 <= self.opacity <= 1.0:
             raise InputError(f"overlay: opacity is {self.opacity}, expected 0 to 1")
-        if not 0 <= self.decimals <= 4:
-            raise InputError(f"overlay: decimals is {self.decimals}, expected 0 to 4")
+        if not 0 <= DECIMALS <= 4:
+            raise InputError(f"overlay: decimals is {DECIMALS}, expected 0 to 4")
         if self.arrow_scale is not None and not (math.isfinite(self.arrow_scale) and self.arrow_scale > 0):
             raise InputError(f"overlay: arrow_scale is {self.arrow_scale}, expected a positive number")
         if self.max_labels < 0:

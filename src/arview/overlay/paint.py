@@ -179,10 +179,15 @@ def arrow(image: Image, tail_px: Array, tip_px: Array, rgb: Rgb, width_px: float
     half, wing = 0.5 * width_px, 0.48 * head
     outline = np.stack(
         [
-            tail_px - half * across, neck - half * across, neck - wing * across, tip_px,
-            neck + wing * across, neck + half * across, tail_px + half * across,
+            tail_px - half * across,
+            neck - half * across,
+            neck - wing * across,
+            tip_px,
+            neck + wing * across,
+            neck + half * across,
+            tail_px + half * across,
         ]
-    )  # fmt: skip
+    )
     fixed = np.round(outline * 2**_SHIFT).astype(np.int32).reshape(-1, 1, 2)
     cv2.polylines(image, [fixed], True, _OUTLINE_RGB, 3, cv2.LINE_AA, _SHIFT)
     cv2.fillPoly(image, [fixed], rgb, cv2.LINE_AA, _SHIFT)
@@ -204,9 +209,13 @@ def _blend_mask(image: NDArray[np.uint8], mask: NDArray[np.uint8], x: int, y: in
 
 @kernel(fastmath=True)
 def _blend_sprite(
-    image: NDArray[np.uint8], rgb: NDArray[np.uint8], alpha: NDArray[np.uint8], x: int, y: int,
-    opacity: float | np.float32
-) -> None:  # fmt: skip
+    image: NDArray[np.uint8],
+    rgb: NDArray[np.uint8],
+    alpha: NDArray[np.uint8],
+    x: int,
+    y: int,
+    opacity: float | np.float32,
+) -> None:
     height, width = image.shape[0], image.shape[1]
     for i in range(max(0, -y), min(alpha.shape[0], height - y)):
         for j in range(max(0, -x), min(alpha.shape[1], width - x)):

@@ -31,6 +31,9 @@ from arview.overlay.options import OverlayOptions
 from arview.overlay.status import StatusLine
 from arview.pose import ComponentPresence, Pose, TrackingState
 
+SHOW_ARROWS = True
+"""Draw displacements as arrows."""
+
 _SAME_PLACE = 0.02
 """Distance in diameters within which a component is at one place in all ambiguous poses."""
 _CRITICAL_DIMMING = 0.55
@@ -267,10 +270,14 @@ class OverlayRenderer:
     def _make_status(self) -> StatusLine:
         arrows = self._arrows_in_model([DrawnEvidence.SEEN] * len(self._names))
         return StatusLine(
-            self.camera.width, self.camera.height, round(0.95 * self._size_px), self.inspection,
-            self._arrow_scale if self.options.show_arrows and len(arrows) else None,
-            len(self._names) > 1 and self.options.show_evidence, bool(self._pending),
-        )  # fmt: skip
+            self.camera.width,
+            self.camera.height,
+            round(0.95 * self._size_px),
+            self.inspection,
+            self._arrow_scale if SHOW_ARROWS and len(arrows) else None,
+            len(self._names) > 1 and self.options.show_evidence,
+            bool(self._pending),
+        )
 
     def _make_annotations(self, bottom_px: int) -> Annotations:
         texts = [
@@ -301,7 +308,7 @@ class OverlayRenderer:
             index = {name: number for number, name in enumerate(self._names)}
             wanted = labels.text_urgency(self._names, self.inspection, by_name, self._pending)
             order = tuple(index[name] for name in wanted) if self.options.show_labels and not is_withheld else ()
-            arrows = self._arrows_in_model(list(evidence)) if self.options.show_arrows else np.zeros((0, 2, 3))
+            arrows = self._arrows_in_model(list(evidence)) if SHOW_ARROWS else np.zeros((0, 2, 3))
             self._scene = _PartLook(key, evidence, styles, order, arrows, {})
         return self._scene
 
@@ -333,9 +340,19 @@ class OverlayRenderer:
             # What was seen to be missing or displaced is shown in full, because it may be why the pose is critical.
             dimming[[not seen.is_refuted for seen in scene.evidence], 3] = _CRITICAL_DIMMING
         blend(
-            canvas, view.u0, view.v0, face_ids, view.shade, view.components,
-            styles.ghost * dimming, cover, owner, styles.edges * dimming, styles.patterns, self._hatch_px,
-        )  # fmt: skip
+            canvas,
+            view.u0,
+            view.v0,
+            face_ids=face_ids,
+            shade=view.shade,
+            components=view.components,
+            ghost_style=styles.ghost * dimming,
+            edge_cover=cover,
+            edge_owner=owner,
+            edge_style=styles.edges * dimming,
+            patterns=styles.patterns,
+            hatch_px=self._hatch_px,
+        )
         for index, seen in enumerate(scene.evidence):
             presence = presences[index]
             if seen is DrawnEvidence.DISPLACED and presence is not None and presence.model_from_nominal is not None:

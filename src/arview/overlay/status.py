@@ -103,9 +103,12 @@ class StatusLine:
             about_part = []
         y = top + round(0.16 * self._size)
         paint.dot(
-            image, (self._pad + 0.3 * self._size, y + 0.72 * self._size), _STATE_RGB[pose.state],
-            0.34 * self._size, False,
-        )  # fmt: skip
+            image,
+            (self._pad + 0.3 * self._size, y + 0.72 * self._size),
+            _STATE_RGB[pose.state],
+            0.34 * self._size,
+            False,
+        )
         if self._is_one_row:
             self._row(image, tracking, self._indent(), y)
             if about_part:

@@ -31,6 +31,7 @@ from arview.reconstruction.matching import match_descriptors
 from arview.reconstruction.memory import SparseMemory, feature_prints
 from arview.reconstruction.pairs import promising_pairs
 from arview.reconstruction.sparse import (
+    MIN_MATCHES,
     SparseOptions,
     color_points,
     main_group,
@@ -44,15 +45,21 @@ Hidden = Callable[[int, NDArray[np.float32]], NDArray[np.bool_]]
 """Of an earlier photo, by its index, and pixels (N,2): which of them (N,) show what was moved."""
 
 
+MIN_INLIERS = 25
+"""Matched points that agree on a new photo's pose."""
+MAX_ERROR_PX = 4.0
+"""Of such a point."""
+MIN_PLACED = 3
+"""New photos; a point needs two, and the third can contradict them."""
+MAX_HINT_ANGLE_DEG = 45.0
+"""Between rough poses of a new and an earlier photo that are matched."""
+
+
 @dataclass(frozen=True)
 class AddedOptions:
     """Options of placing photos in a reconstruction."""
 
     sparse: SparseOptions = field(default_factory=SparseOptions)
-    min_inliers: int = 25  # matched points that agree on a new photo's pose
-    max_error_px: float = 4.0  # of such a point
-    min_placed: int = 3  # new photos; a point needs two, and the third can contradict them
-    max_hint_angle_deg: float = 45.0  # between rough poses of a new and an earlier photo that are matched
 
 
 class EarlierPhotos:
@@ -81,9 +88,14 @@ class EarlierPhotos:
         self.posed = [(photo, one.cam_from_scan) for photo, one in zip(self.photos, whole.photos, strict=True)]
         # The matches of these pairs are found now and remembered, because nobody waits yet.
         match_all_along_lines(
-            model_of_poses(self.posed), self.photos, self.features, options.sparse, self.threads, _nothing,
+            model_of_poses(self.posed),
+            self.photos,
+            self.features,
+            options.sparse,
+            self.threads,
+            _nothing,
             memory=memory,
-        )  # fmt: skip
+        )
 
     def _points_of(self, index: int) -> NDArray[np.int64]:
         """(N,) the point of ``whole`` that each feature of a photo belongs to, or −1."""
@@ -107,7 +119,7 @@ class EarlierPhotos:
         """
         count, sparse = len(self.photos), self.options.sparse
         everything = [*self.features, *features]
-        limit = np.cos(np.deg2rad(self.options.max_hint_angle_deg))
+        limit = np.cos(np.deg2rad(MAX_HINT_ANGLE_DEG))
         pairs = [(i, count + j) for j in range(len(photos)) for i in range(count)]
         hinted = {count + j: poses[photo.name][2, :3] for j, photo in enumerate(photos) if photo.name in poses}
         prints, device = feature_prints(everything), torch_device(sparse.device)
@@ -118,7 +130,7 @@ class EarlierPhotos:
             return self.memory.matches(key, lambda: match_descriptors(one, other, device))
 
         with ThreadPoolExecutor(self.threads) as pool, threadpool_limits(1, "blas"):
-            promising = set(promising_pairs(everything, sparse.pairs, [p for p in pairs if p[1] not in hinted], pool))
+            promising = set(promising_pairs(everything, [p for p in pairs if p[1] not in hinted], pool))
             near = {(i, j) for i, j in pairs if j in hinted and self.posed[i][1][2, :3] @ hinted[j] > limit}
             chosen = sorted(promising | near)
             matches = dict(zip(chosen, pool.map(find, chosen), strict=True))
@@ -132,10 +144,12 @@ class EarlierPhotos:
                     points.append(self.points[i][rows[known, 0]])
                     pixels.append(one.points_px[rows[known, 1]])
             which = np.concatenate(points) if points else np.zeros(0, dtype=np.int64)
-            found.append((
-                self.whole.points_in_scan[which],
-                np.concatenate(pixels).astype(np.float64) if pixels else np.zeros((0, 2)),
-            ))  # fmt: skip
+            found.append(
+                (
+                    self.whole.points_in_scan[which],
+                    np.concatenate(pixels).astype(np.float64) if pixels else np.zeros((0, 2)),
+                )
+            )
         return found
 
     def add(
@@ -162,28 +176,28 @@ class EarlierPhotos:
         tell("matching", 0, 1)
         placed, left_out, kept = [], [], []
         for photo, one, (points, pixels) in zip(photos, features, self.match(photos, features, poses), strict=True):
-            pose = place_photo(photo, points, pixels, self.options)
+            pose = place_photo(photo, points, pixels)
             if pose is None:
                 left_out.append((photo.name, "shows too little of what the earlier photos show"))
             else:
                 placed.append((photo, pose))
                 kept.append(one)
-        if len(placed) < self.options.min_placed:
+        if len(placed) < MIN_PLACED:
             raise CannotMeasureError(
                 f"only {len(placed)} of {len(photos)} new photos could be placed among the earlier ones; take "
-                f"{self.options.min_placed} or more that also show what is around the component"
+                f"{MIN_PLACED} or more that also show what is around the component"
             )
         joint = [photo for photo, _ in [*self.posed, *placed]]
         everything = [*self.features, *kept]
         model = model_of_poses([*self.posed, *placed])
         path = folder / "database.db"
-        write_database(path, joint, everything, {}, sparse.min_matches, sparse.seed)
+        write_database(path, joint, everything, {}, MIN_MATCHES, sparse.seed)
         write_matches(
             path,
             match_all_along_lines(model, joint, everything, sparse, self.threads, tell, memory=self.memory),
         )
         model, adjuster = triangulate_and_adjust(model, path, folder, sparse, self.threads, tell, keeps_centre=True)
-        found, split = main_group(model, adjuster, joint, sparse, self.threads)
+        found, split = main_group(model, adjuster, joint, self.threads)
         color_points(model, everything)
         scale, motion = onto(found, self.whole)
         model.transform(pycolmap.Sim3d(scale, pycolmap.Rotation3d(motion[:3, :3]), motion[:3, 3]))
@@ -192,19 +206,25 @@ class EarlierPhotos:
         return replace(found.transformed(scale, motion), unplaced=tuple(left_out))
 
 
-def place_photo(photo: Photo, points: Array, pixels: Array, options: AddedOptions) -> Array | None:
+def place_photo(photo: Photo, points: Array, pixels: Array) -> Array | None:
     """``cam_from_scan`` (4,4) of a photo that shows known points (N,3) at pixels (N,2); None if too few agree.
 
     RANSAC over minimal sets, refined on all that agree (Lepetit 2009, EPnP; Levenberg-Marquardt).
     """
-    if len(points) < options.min_inliers:
+    if len(points) < MIN_INLIERS:
         return None
     rays = photo.camera.unproject(pixels)[:, :2]
     is_good, turn, shift, agree = cv2.solvePnPRansac(
-        points, rays, np.eye(3), None, iterationsCount=3000, reprojectionError=options.max_error_px / photo.camera.fx,
-        confidence=0.9999, flags=cv2.SOLVEPNP_EPNP,
-    )  # fmt: skip
-    if not is_good or agree is None or len(agree) < options.min_inliers:
+        points,
+        rays,
+        np.eye(3),
+        None,
+        iterationsCount=3000,
+        reprojectionError=MAX_ERROR_PX / photo.camera.fx,
+        confidence=0.9999,
+        flags=cv2.SOLVEPNP_EPNP,
+    )
+    if not is_good or agree is None or len(agree) < MIN_INLIERS:
         return None
     some = agree.ravel()
     turn, shift = cv2.solvePnPRefineLM(points[some], rays[some], np.eye(3), np.zeros(0), turn, shift)

@@ -15,22 +15,26 @@ from arview.geometry import Array, apply, look_at
 from arview.rendering.rasterizer import rasterise
 from arview.rendering.renderers import ZBufferRenderer
 
-
-@dataclass(frozen=True)
-class CoverageOptions:
-    """When a component counts as seen, and from how many places it should be seen."""
-
-    max_side_px: int = 400  # of the rendered pictures; a component of 1 % of the width still has 16 px
-    min_px: int = 12  # visible pixels at that size, below which nothing on a component can be matched
-    min_share: float = 0.3  # visible share of a component's own silhouette that counts as seen
-    direction_deg: float = 15.0  # views that differ by less count as one direction
-    photos_wanted: int = 4  # one more than the minimum that can contradict each other
-    directions_wanted: int = 3  # two determine a distance, the third confirms it
-    hidden_edges: float = 0.25  # share of the CAD's edges, beyond chance, below which most of the part is hidden
-    one_side_deg: float = 40.0  # if no two views of the part differ by more, depth is poorly known
-    alone_deg: float = 35.0  # a photo farther than this from its nearest neighbour cannot be matched well
-    gap_deg: float = 150.0  # azimuth range without photos that is reported
-    tried_directions: int = 80  # about 22° apart, from which a poorly seen component is searched for in the CAD
+MAX_SIDE_PX = 400
+"""Of the rendered pictures; a component of 1 % of the width still has 16 px."""
+MIN_PX = 12
+"""Visible pixels at that size, below which nothing on a component can be matched."""
+MIN_SHARE = 0.3
+"""Visible share of a component's own silhouette that counts as seen."""
+DIRECTION_DEG = 15.0
+"""Views that differ by less count as one direction."""
+PHOTOS_WANTED = 4
+"""One more than the minimum that can contradict each other."""
+DIRECTIONS_WANTED = 3
+"""Two determine a distance, the third confirms it."""
+ONE_SIDE_DEG = 40.0
+"""If no two views of the part differ by more, depth is poorly known."""
+ALONE_DEG = 35.0
+"""A photo farther than this from its nearest neighbour cannot be matched well."""
+GAP_DEG = 150.0
+"""Azimuth range without photos that is reported."""
+TRIED_DIRECTIONS = 80
+"""About 22° apart, from which a poorly seen component is searched for in the CAD."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +68,6 @@ class Coverage:
 def coverage(
     model: Model,
     views: Sequence[tuple[Camera, Array]],
-    options: CoverageOptions | None = None,
     names: Sequence[str] | None = None,
 ) -> Coverage:
     """From how many photos and directions each component is seen without being hidden by others.
@@ -72,13 +75,11 @@ def coverage(
     Args:
         model: the nominal CAD.
         views: (camera, ``cam_from_model`` (4,4)) of each photo.
-        options: see `CoverageOptions`.
         names: of the photos, for the advice; default: numbers from 1.
 
     Raises:
         InputError: there are no views, or the number of names differs.
     """
-    options = options or CoverageOptions()
     if not views:
         raise InputError("coverage: no camera poses given; place the photos first")
     names = [f"photo {number}" for number in range(1, len(views) + 1)] if names is None else names
@@ -86,7 +87,7 @@ def coverage(
         raise InputError(f"coverage: {len(names)} names for {len(views)} camera poses")
     centres = np.array([-pose[:3, :3].T @ pose[:3, 3] for _, pose in views])
     axis = _orbit_axis(unit(centres - model.center_in_model))
-    seen = np.array([components_seen(model, camera, pose, options) for camera, pose in views])
+    seen = np.array([components_seen(model, camera, pose) for camera, pose in views])
     components = []
     for index, component in enumerate(model.components):
         photos = np.flatnonzero(seen[:, index])
@@ -95,45 +96,47 @@ def coverage(
             ComponentCoverage(
                 component.name,
                 tuple(int(photo) for photo in photos),
-                count_separated(directions, options.direction_deg),
+                count_separated(directions, DIRECTION_DEG),
                 spread_deg(directions),
                 _gap(directions, axis)[0],
             )
         )
-    advice = _advice_on_part(model, names, centres, axis, options)
-    advice += _advice_on_components(model, components, views[0][0], centres, axis, options)
+    advice = _advice_on_part(model, names, centres, axis)
+    advice += _advice_on_components(model, components, views[0][0], centres, axis)
     return Coverage(tuple(components), tuple(advice))
 
 
-def components_seen(
-    model: Model, camera: Camera, cam_from_model: Array, options: CoverageOptions | None = None
-) -> list[bool]:
+def components_seen(model: Model, camera: Camera, cam_from_model: Array) -> list[bool]:
     """For each component of a model, whether a photo at a pose (4,4) shows enough of it, by a small rendering."""
-    options = options or CoverageOptions()
-    scale = min(1.0, options.max_side_px / max(camera.width, camera.height))
+    scale = min(1.0, MAX_SIDE_PX / max(camera.width, camera.height))
     small = camera.scaled(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
     ids = ZBufferRenderer(model, small).render(cam_from_model).component_ids
     visible = np.bincount(ids[ids >= 0], minlength=len(model.components))
     result = []
     for component, pixels in zip(model.components, visible, strict=True):
-        enough = bool(pixels >= options.min_px)
+        enough = bool(pixels >= MIN_PX)
         if enough:
             points = apply(cam_from_model, component.vertices_in_model)
             _, faces = rasterise(
-                points, component.faces, small.fx, small.fy, small.cx, small.cy, small.width, small.height
+                points,
+                component.faces,
+                small.fx,
+                fy=small.fy,
+                cx=small.cx,
+                cy=small.cy,
+                width=small.width,
+                height=small.height,
             )
-            enough = bool(pixels >= options.min_share * np.count_nonzero(faces >= 0))
+            enough = bool(pixels >= MIN_SHARE * np.count_nonzero(faces >= 0))
         result.append(enough)
     return result
 
 
-def _advice_on_part(
-    model: Model, names: Sequence[str], centres: Array, axis: Array, options: CoverageOptions
-) -> list[str]:
+def _advice_on_part(model: Model, names: Sequence[str], centres: Array, axis: Array) -> list[str]:
     """Advice about directions from which the whole part should be photographed."""
     directions = unit(centres - model.center_in_model)
     spread = spread_deg(directions)
-    if spread < options.one_side_deg:
+    if spread < ONE_SIDE_DEG:
         return [
             f"all photos are taken from one side (within {spread:.0f}°): depth is poorly known; walk around the "
             "part, or at least a quarter of the way"
@@ -142,13 +145,13 @@ def _advice_on_part(
     cosines = directions @ directions.T
     np.fill_diagonal(cosines, -1.0)
     nearest_deg = np.degrees(np.arccos(np.clip(cosines.max(axis=1), -1.0, 1.0)))
-    for photo in np.flatnonzero(nearest_deg > options.alone_deg):
+    for photo in np.flatnonzero(nearest_deg > ALONE_DEG):
         advice.append(
             f"{names[int(photo)]} overlaps too little with the others (the nearest was taken {nearest_deg[photo]:.0f}° "
             "away); add photos between them"
         )
     gap_deg, towards = _gap(directions, axis)
-    if gap_deg > options.gap_deg:
+    if gap_deg > GAP_DEG:
         advice.append(f"no photo within {gap_deg:.0f}° around the side {_named(towards)}; take some from there")
     return advice
 
@@ -159,23 +162,20 @@ def _advice_on_components(
     camera: Camera,
     centres: Array,
     axis: Array,
-    options: CoverageOptions,
 ) -> list[str]:
     """Advice about components that are seen in too few photos or from too few directions."""
     poor = [
         index
         for index, covered in enumerate(components)
-        if len(covered.photos) < options.photos_wanted or covered.directions < options.directions_wanted
+        if len(covered.photos) < PHOTOS_WANTED or covered.directions < DIRECTIONS_WANTED
     ]
     if not poor:
         return []
     # Directions from which each component would be visible: cameras all around, at the distance of the photos.
     distance_mm = float(np.median(np.linalg.norm(centres - model.center_in_model, axis=1)))
-    tried = model.center_in_model + distance_mm * _sphere(options.tried_directions)
+    tried = model.center_in_model + distance_mm * _sphere(TRIED_DIRECTIONS)
     up = np.array([0.0, 0.0, 1.0])
-    visible = np.array(
-        [components_seen(model, camera, look_at(eye, model.center_in_model, up), options) for eye in tried]
-    )
+    visible = np.array([components_seen(model, camera, look_at(eye, model.center_in_model, up)) for eye in tried])
     lowest = float((unit(centres - model.center_in_model) @ axis).min())
     in_reach = unit(tried - model.center_in_model) @ axis >= lowest - 0.1
 
@@ -194,7 +194,7 @@ def _advice_on_components(
         candidates = unit(tried[where] - middle)
         taken = unit(centres[list(covered.photos)] - middle)
         nearest = (candidates @ taken.T).max(axis=1) if len(taken) else -(candidates @ axis)
-        missing = max(options.photos_wanted - len(covered.photos), options.directions_wanted - covered.directions)
+        missing = max(PHOTOS_WANTED - len(covered.photos), DIRECTIONS_WANTED - covered.directions)
         side = _named(unit(tried[where][np.argmin(nearest)] - model.center_in_model))
         advice.append(f"{state}; take {missing} more of it, for example from the side {side}")
     return advice

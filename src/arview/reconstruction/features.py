@@ -18,13 +18,17 @@ from arview.reconstruction.types import Photo
 Descriptors = NDArray[np.float32]
 
 
+MAX_SIDE_PX = 2000
+"""Larger photos are reduced to this, because SIFT's time grows with the area."""
+CONTRAST_THRESHOLD = 0.02
+"""OpenCV's default of 0.04 finds little on mill scale and brushed metal."""
+
+
 @dataclass(frozen=True)
 class FeatureOptions:
     """Options of feature detection."""
 
     max_features: int = 6000  # per photo; more cost time and add mainly short tracks
-    max_side_px: int = 2000  # larger photos are reduced to this, because SIFT's time grows with the area
-    contrast_threshold: float = 0.02  # OpenCV's default of 0.04 finds little on mill scale and brushed metal
 
 
 @dataclass(frozen=True)
@@ -49,9 +53,11 @@ class Features:
     def taken(self, which: NDArray[Any]) -> Features:
         """Some of the features, by indices or a mask."""
         return Features(
-            self.points_px[which], np.ascontiguousarray(self.descriptors[which]), self.sizes_px[which],
+            self.points_px[which],
+            np.ascontiguousarray(self.descriptors[which]),
+            self.sizes_px[which],
             self.colors[which],
-        )  # fmt: skip
+        )
 
 
 _NONE = Features(
@@ -96,7 +102,7 @@ def detect_features(
     """
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     height, width = grey.shape
-    reduction = max(1.0, max(height, width) / options.max_side_px)
+    reduction = max(1.0, max(height, width) / MAX_SIDE_PX)
     if reduction > 1.0:
         size = (round(width / reduction), round(height / reduction))
         grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
@@ -106,7 +112,7 @@ def detect_features(
     if device is None:
         points, sizes, strength, sums = _opencv_sift(grey, options, allowed)
     else:
-        points, sizes, strength, sums = sift(grey, options.max_features, options.contrast_threshold, allowed, device)
+        points, sizes, strength, sums = sift(grey, options.max_features, CONTRAST_THRESHOLD, allowed, device)
     if len(points) == 0:
         return DetectedFeatures(_NONE.points_px, _NONE.descriptors, _NONE.sizes_px, _NONE.colors)
     order = _spread(points, strength, grey.shape)[: options.max_features]
@@ -127,7 +133,7 @@ def _opencv_sift(grey: NDArray[np.uint8], options: FeatureOptions, allowed: NDAr
     """
     detector = cv2.SIFT_create(  # type: ignore[attr-defined]
         nfeatures=options.max_features,
-        contrastThreshold=options.contrast_threshold,
+        contrastThreshold=CONTRAST_THRESHOLD,
         enable_precise_upscale=True,
     )
     keys, sums = detector.detectAndCompute(grey, allowed)

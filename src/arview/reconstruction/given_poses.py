@@ -149,8 +149,16 @@ def _colmap_camera(camera: Any, folder: Path) -> Camera:
     p = dict(zip(names, (float(value) for value in camera.params), strict=True))
     if any(p.get(name, 0.0) for name in ("k4", "k5", "k6")):
         raise InputError(f"{folder}: the rational lens model (k4 to k6) is not supported; undistort the photos first")
-    return _camera(camera.width, camera.height, p.get("fx", p.get("f", 0.0)), p.get("fy", p.get("f", 0.0)),
-                   p["cx"] - HALF_PX, p["cy"] - HALF_PX, p, folder)  # fmt: skip
+    return _camera(
+        camera.width,
+        camera.height,
+        p.get("fx", p.get("f", 0.0)),
+        fy=p.get("fy", p.get("f", 0.0)),
+        cx=p["cx"] - HALF_PX,
+        cy=p["cy"] - HALF_PX,
+        terms=p,
+        path=folder,
+    )
 
 
 def _read_transforms(path: Path) -> tuple[GivenPose, ...]:
@@ -172,7 +180,7 @@ def _transforms_pose(entry: dict[str, Any], path: Path) -> GivenPose:
     fy = float(entry.get("fl_y") or fx)
     cx, cy = float(entry.get("cx", 0.5 * width)) - HALF_PX, float(entry.get("cy", 0.5 * height)) - HALF_PX
     world_from_cam = _rigid_of(np.array(entry["transform_matrix"], dtype=np.float64), path)
-    camera = _camera(width, height, fx, fy, cx, cy, entry, path)
+    camera = _camera(width, height, fx, fy=fy, cx=cx, cy=cy, terms=entry, path=path)
     return GivenPose(str(entry["file_path"]), camera, invert(world_from_cam @ _OPENGL_AXES))
 
 
@@ -218,8 +226,16 @@ def _metashape_camera(sensor: ElementTree.Element, path: Path) -> Camera:
         raise InputError(f"{path}: a sensor with skew (b2) or k4 is not supported; undistort the photos first")
     # Metashape's p1 belongs to r² + 2x², Brown's to 2xy: they are exchanged.
     terms = {**p, "p1": p.get("p2", 0.0), "p2": p.get("p1", 0.0)}
-    return _camera(width, height, p["f"] + p.get("b1", 0.0), p["f"], 0.5 * width + p.get("cx", 0.0) - HALF_PX,
-                   0.5 * height + p.get("cy", 0.0) - HALF_PX, terms, path)  # fmt: skip
+    return _camera(
+        width,
+        height,
+        p["f"] + p.get("b1", 0.0),
+        fy=p["f"],
+        cx=0.5 * width + p.get("cx", 0.0) - HALF_PX,
+        cy=0.5 * height + p.get("cy", 0.0) - HALF_PX,
+        terms=terms,
+        path=path,
+    )
 
 
 def _camera(

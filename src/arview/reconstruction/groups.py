@@ -8,7 +8,6 @@ few points join them. Groups are found on the graph of shared points, and by the
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse
@@ -22,28 +21,26 @@ from arview.reconstruction.types import SparseModel
 Members = tuple[int, ...]
 
 
-@dataclass(frozen=True)
-class GroupOptions:
-    """When photos count as placed relative to each other."""
+MIN_SHARED_POINTS = 15
+"""Across a cut; fewer can be due to chance."""
+MAX_RELATIVE_PX = 1.0
+"""Standard deviation of one side's view of the other; more is not a common frame."""
+POINTS_OF_PHOTO = 60
+"""Points of a photo in which that deviation is evaluated."""
 
-    min_shared_points: int = 15  # across a cut; fewer can be due to chance
-    max_relative_px: float = 1.0  # standard deviation of one side's view of the other; more is not a common frame
-    points_of_photo: int = 60  # points of a photo in which that deviation is evaluated
 
-
-def linked_groups(sparse: SparseModel, options: GroupOptions | None = None) -> tuple[Members, ...]:
+def linked_groups(sparse: SparseModel) -> tuple[Members, ...]:
     """Indices of the photos of each group, the group with most photos (then most points) first.
 
     The photos are cut where the fewest points join them, as long as the parts share too few points or the covariance
     of the poses leaves one part free to move against the other.
     """
-    options = options or GroupOptions()
     shared = shared_points(sparse)
     groups: list[Members] = []
     pending = [tuple(range(len(sparse.photos)))]
     while pending:
         members = pending.pop()
-        parts = _weakest_cut(sparse, shared, members, options)
+        parts = _weakest_cut(sparse, shared, members)
         if parts is None:
             groups.append(members)
         else:
@@ -62,9 +59,7 @@ def shared_points(sparse: SparseModel) -> NDArray[np.int64]:
     return np.asarray((seen.T @ seen).toarray(), dtype=np.int64)
 
 
-def _weakest_cut(
-    sparse: SparseModel, shared: NDArray[np.int64], members: Members, options: GroupOptions
-) -> list[Members] | None:
+def _weakest_cut(sparse: SparseModel, shared: NDArray[np.int64], members: Members) -> list[Members] | None:
     """Two parts of some photos that are not placed relative to each other; None if there are none."""
     if len(members) < 2:
         return None
@@ -84,7 +79,7 @@ def _weakest_cut(
         )
     # The cut with the fewest points is the weak link: others on either side of it are loose for its sake only.
     for across, parts in sorted(cuts):
-        if across < options.min_shared_points or relative_px(sparse, parts, options) > options.max_relative_px:
+        if across < MIN_SHARED_POINTS or relative_px(sparse, parts) > MAX_RELATIVE_PX:
             return parts
     return None
 
@@ -109,7 +104,7 @@ def _points_of(sparse: SparseModel, members: Sequence[int]) -> int:
     return len(np.unique(sparse.observed_point[np.isin(sparse.observed_photo, members)]))
 
 
-def relative_px(sparse: SparseModel, parts: Sequence[Members], options: GroupOptions) -> float:
+def relative_px(sparse: SparseModel, parts: Sequence[Members]) -> float:
     """Standard deviation in px by which the smaller part, as a whole, can move against the larger one.
 
     The joint covariance is expressed in the frame of the larger part (S-transformation, Baarda 1973). The common move
@@ -137,7 +132,7 @@ def relative_px(sparse: SparseModel, parts: Sequence[Members], options: GroupOpt
     for i in smaller:
         photo = sparse.photos[i]
         seen = np.flatnonzero(sparse.observed_photo == i)
-        seen = seen[:: max(1, len(seen) // options.points_of_photo)]
+        seen = seen[:: max(1, len(seen) // POINTS_OF_PHOTO)]
         in_cam = sparse.points_in_scan[sparse.observed_point[seen]] @ photo.cam_from_scan[:3, :3].T
         in_cam = in_cam + photo.cam_from_scan[:3, 3]
         jacobian = _pixel_moves(in_cam, photo.camera.fx) @ gauge[6 * i : 6 * i + 6]

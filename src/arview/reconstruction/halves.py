@@ -18,16 +18,18 @@ from arview.errors import CannotMeasureError
 from arview.geometry import Array, rigid
 from arview.reconstruction.colmap import import_pycolmap, read_reconstruction, sparse_model_of
 from arview.reconstruction.covariance import pose_covariance
-from arview.reconstruction.groups import linked_groups
-from arview.reconstruction.sparse import SparseOptions, adjust, adjust_with_centre
+from arview.reconstruction.groups import MIN_SHARED_POINTS, linked_groups
+from arview.reconstruction.sparse import MAX_ERROR_PX, MIN_ANGLE_DEG, SparseOptions, adjust, adjust_with_centre
 from arview.reconstruction.types import Photo, PosedPhoto, SparseModel
+
+MIN_PHOTOS = 16
+"""Placed photos; fewer than eight in a half leave gaps that the whole set does not have."""
 
 
 @dataclass(frozen=True)
 class HalvesOptions:
     """When a set is halved, and how the halves are adjusted."""
 
-    min_photos: int = 16  # placed photos; fewer than eight in a half leave gaps that the whole set does not have
     sparse: SparseOptions = field(default_factory=SparseOptions)
 
 
@@ -43,8 +45,8 @@ def halves_of(folder: Path, sparse: SparseModel, options: HalvesOptions | None =
         CannotMeasureError: there are too few photos, or those of a half are not placed without the others.
     """
     options = options or HalvesOptions()
-    if len(sparse.photos) < options.min_photos:
-        raise CannotMeasureError(f"{len(sparse.photos)} photos are too few to be halved ({options.min_photos} needed)")
+    if len(sparse.photos) < MIN_PHOTOS:
+        raise CannotMeasureError(f"{len(sparse.photos)} photos are too few to be halved ({MIN_PHOTOS} needed)")
     return tuple(adjusted_alone(folder, sparse, sparse.photos[first::2], options.sparse) for first in (0, 1))
 
 
@@ -73,23 +75,21 @@ def adjusted_alone(
     model.tear_down()
     listed = [_listed(photo) for photo in photos]
     threads = options.threads or os.cpu_count() or 1
-    refines_centre = adjust_with_centre(model, options, threads)
-    pycolmap.ObservationManager(model).filter_all_points3D(options.max_error_px, options.min_angle_deg)
-    if len(model.points3D) < options.groups.min_shared_points:
+    refines_centre = adjust_with_centre(model, threads)
+    pycolmap.ObservationManager(model).filter_all_points3D(MAX_ERROR_PX, MIN_ANGLE_DEG)
+    if len(model.points3D) < MIN_SHARED_POINTS:
         raise CannotMeasureError(f"{named} share too few points")
     adjuster = adjust(model, threads, refines_centre=refines_centre)
     sparse = sparse_model_of(model, listed)
     sparse = replace(sparse, pose_covariance=pose_covariance(sparse, model, adjuster))
-    if len(linked_groups(sparse, options.groups)) > 1:
+    if len(linked_groups(sparse)) > 1:
         raise CannotMeasureError(f"{named} are not placed without the others")
     return sparse.transformed(*onto(sparse, whole))
 
 
 def _listed(photo: PosedPhoto) -> Photo:
     """A placed photo as a photo of intake; its camera is that of the model."""
-    return Photo(
-        photo.name, photo.path, photo.camera.width, photo.camera.height, "", photo.camera, mask=photo.mask
-    )  # fmt: skip
+    return Photo(photo.name, photo.path, photo.camera.width, photo.camera.height, "", photo.camera, mask=photo.mask)
 
 
 def onto(sparse: SparseModel, whole: SparseModel) -> tuple[float, Array]:

@@ -22,9 +22,14 @@ _BLOCK = 512  # rows of similarities computed at a time, which fit into the proc
 
 @kernel
 def _best(
-    similarity: NDArray[np.float32], first_row: int, partner: NDArray[np.int32], best: NDArray[np.float32],
-    second: NDArray[np.float32], column_best: NDArray[np.float32], column_row: NDArray[np.int32]
-) -> None:  # fmt: skip
+    similarity: NDArray[np.float32],
+    first_row: int,
+    partner: NDArray[np.int32],
+    best: NDArray[np.float32],
+    second: NDArray[np.float32],
+    column_best: NDArray[np.float32],
+    column_row: NDArray[np.int32],
+) -> None:
     """Best and second best column of each row, and best row of each column; rows start at ``first_row``."""
     for i in range(similarity.shape[0]):
         row = i + first_row
@@ -78,12 +83,24 @@ def epipolar_inliers(ones: Features, others: Features, matches: Matches, max_err
 
 @kernel(fastmath=True)
 def _match_along(
-    rays: NDArray[np.float64], other_px: NDArray[np.float64], descriptors: NDArray[np.float32],
-    others: NDArray[np.float32], sizes: NDArray[np.float32], other_sizes: NDArray[np.float32],
-    essential: NDArray[np.float64], focal: float, band_px: float, cells: NDArray[np.int32], starts: NDArray[np.int32],
-    cell_px: NDArray[np.float64], columns: int, rows: int, partner: NDArray[np.int32], best: NDArray[np.float32],
-    second: NDArray[np.float32]
-) -> None:  # fmt: skip
+    rays: NDArray[np.float64],
+    other_px: NDArray[np.float64],
+    descriptors: NDArray[np.float32],
+    others: NDArray[np.float32],
+    sizes: NDArray[np.float32],
+    other_sizes: NDArray[np.float32],
+    essential: NDArray[np.float64],
+    focal: float,
+    band_px: float,
+    cells: NDArray[np.int32],
+    starts: NDArray[np.int32],
+    cell_px: NDArray[np.float64],
+    columns: int,
+    rows: int,
+    partner: NDArray[np.int32],
+    best: NDArray[np.float32],
+    second: NDArray[np.float32],
+) -> None:
     """Best and second best of ``others`` within ``band_px`` of each ray's epipolar line.
 
     ``rays`` are ideal directions (N,2), ``other_px`` ideal pixels about the principal point; ``cells`` lists the
@@ -192,9 +209,24 @@ def _along_one_way(
     starts = np.searchsorted(cell[cells], np.arange(columns * rows + 1)).astype(np.int32)
     grid = np.array([step, low[0], low[1]])
     _match_along(
-        rays[0], other_px, ones.descriptors, others.descriptors, ones.sizes_px, others.sizes_px, essential, focal_px,
-        band_px, cells, starts, grid, columns, rows, partner, best, second,
-    )  # fmt: skip
+        rays[0],
+        other_px,
+        ones.descriptors,
+        others=others.descriptors,
+        sizes=ones.sizes_px,
+        other_sizes=others.sizes_px,
+        essential=essential,
+        focal=focal_px,
+        band_px=band_px,
+        cells=cells,
+        starts=starts,
+        cell_px=grid,
+        columns=columns,
+        rows=rows,
+        partner=partner,
+        best=best,
+        second=second,
+    )
     angle, next_angle = np.arccos(np.clip(best, -1, 1)), np.arccos(np.clip(second, -1, 1))
     partner[(angle > MAX_RATIO * next_angle) | (angle > MAX_ANGLE_RAD)] = -1
     return partner

@@ -25,17 +25,20 @@ MAX_PAIR_ANGLE_DEG = 45.0
 """Largest angle between the viewing directions of a pair; beyond it SIFT finds nothing in common."""
 
 
-@dataclass(frozen=True)
-class PairOptions:
-    """How pairs of photos are chosen."""
-
-    preview_features: int = 400  # per photo, to choose the pairs to match; Wu 2013
-    preview_matches: int = 5  # of these that a chosen pair needs; chance gives 0 to 3
-    all_pairs_up_to: int = 12  # photos; up to this number every pair is matched
-    neighbours: int = 3  # following photos that are always matched: a walk around the part, a video
-    hints_from: int = 30  # photos from which rough poses choose the pairs; fewer are matched as without them
-    max_hint_angle_deg: float = 60.0  # between the directions of two rough poses; SIFT finds nothing beyond 45°
-    min_partners: int = 2  # of a photo with a rough pose; with fewer, its pose is not trusted
+PREVIEW_FEATURES = 400
+"""Per photo, to choose the pairs to match; Wu 2013."""
+PREVIEW_MATCHES = 5
+"""Of these that a chosen pair needs; chance gives 0 to 3."""
+ALL_PAIRS_UP_TO = 12
+"""Photos; up to this number every pair is matched."""
+NEIGHBOURS = 3
+"""Following photos that are always matched: a walk around the part, a video."""
+HINTS_FROM = 30
+"""Photos from which rough poses choose the pairs; fewer are matched as without them."""
+MAX_HINT_ANGLE_DEG = 60.0
+"""Between the directions of two rough poses; SIFT finds nothing beyond 45°."""
+MIN_PARTNERS = 2
+"""Of a photo with a rough pose; with fewer, its pose is not trusted."""
 
 
 @dataclass(frozen=True)
@@ -56,67 +59,71 @@ class KnownPairs:
 
 
 def chosen_pairs(
-    photos: Sequence[Photo], features: Sequence[Features], options: PairOptions, known: KnownPairs,
+    photos: Sequence[Photo],
+    features: Sequence[Features],
+    known: KnownPairs,
     pool: ThreadPoolExecutor,
-) -> list[Pair]:  # fmt: skip
+) -> list[Pair]:
     """Pairs of photos to be matched, in a fixed order."""
     if known.recorded is not None:
         place = {photo.name: index for index, photo in enumerate(photos)}
         given = ((place.get(one), place.get(other)) for one, other in known.recorded)
         return sorted({(min(i, j), max(i, j)) for i, j in given if i is not None and j is not None and i != j})
     pairs = list(itertools.combinations(range(len(photos)), 2))
-    poses = _trusted_poses(photos, options, known)
+    poses = _trusted_poses(photos, known)
     axes = [None if (pose := poses.get(photo.name)) is None else pose[2, :3] for photo in photos]
-    if len(photos) <= options.all_pairs_up_to and all(axis is None for axis in axes):
+    if len(photos) <= ALL_PAIRS_UP_TO and all(axis is None for axis in axes):
         return pairs
-    limit = np.cos(np.deg2rad(options.max_hint_angle_deg))
+    limit = np.cos(np.deg2rad(MAX_HINT_ANGLE_DEG))
 
     def by_pose(pair: Pair) -> bool | None:
         one, other = (axes[index] for index in pair)
         return None if one is None or other is None else bool(one @ other > limit)
 
     unknown = [pair for pair in pairs if by_pose(pair) is None]
-    promising = set(promising_pairs(features, options, unknown, pool))
+    promising = set(promising_pairs(features, unknown, pool))
     return [pair for pair in pairs if by_pose(pair) or pair in promising]
 
 
-def _trusted_poses(photos: Sequence[Photo], options: PairOptions, known: KnownPairs) -> Mapping[str, Array]:
+def _trusted_poses(photos: Sequence[Photo], known: KnownPairs) -> Mapping[str, Array]:
     """The rough poses, where there are so many photos that to choose by them saves time.
 
     With few photos the pairs, and so the numbers, are those that the photos alone give.
     """
-    return known.poses if len(photos) >= options.hints_from else {}
+    return known.poses if len(photos) >= HINTS_FROM else {}
 
 
 def doubtful_pairs(
-    photos: Sequence[Photo], features: Sequence[Features], options: PairOptions, known: KnownPairs,
-    tried: Sequence[Pair], matched: Sequence[Pair], pool: ThreadPoolExecutor,
-) -> list[Pair]:  # fmt: skip
+    photos: Sequence[Photo],
+    features: Sequence[Features],
+    known: KnownPairs,
+    tried: Sequence[Pair],
+    matched: Sequence[Pair],
+    pool: ThreadPoolExecutor,
+) -> list[Pair]:
     """More pairs of photos whose rough pose led to too few partners, so that it is likely to be wrong."""
-    poses = _trusted_poses(photos, options, known)
+    poses = _trusted_poses(photos, known)
     if known.recorded is not None or not poses:
         return []
     partners = np.zeros(len(photos), dtype=int)
     for pair in matched:
         partners[list(pair)] += 1
-    lonely = {i for i, photo in enumerate(photos) if photo.name in poses and partners[i] < options.min_partners}
+    lonely = {i for i, photo in enumerate(photos) if photo.name in poses and partners[i] < MIN_PARTNERS}
     rest = sorted(set(itertools.combinations(range(len(photos)), 2)) - set(tried))
-    return promising_pairs(features, options, [pair for pair in rest if lonely & set(pair)], pool)
+    return promising_pairs(features, [pair for pair in rest if lonely & set(pair)], pool)
 
 
-def promising_pairs(
-    features: Sequence[Features], options: PairOptions, pairs: Sequence[Pair], pool: ThreadPoolExecutor
-) -> list[Pair]:
+def promising_pairs(features: Sequence[Features], pairs: Sequence[Pair], pool: ThreadPoolExecutor) -> list[Pair]:
     """Of some pairs, those whose largest features match often enough (preemptive matching, Wu 2013)."""
-    if len(features) <= options.all_pairs_up_to:
+    if len(features) <= ALL_PAIRS_UP_TO:
         return list(pairs)
     wanted = sorted({index for pair in pairs for index in pair})
-    largest = {index: _largest(features[index], options.preview_features) for index in wanted}
+    largest = {index: _largest(features[index], PREVIEW_FEATURES) for index in wanted}
 
     def is_promising(pair: Pair) -> bool:
-        if pair[1] - pair[0] <= options.neighbours:
+        if pair[1] - pair[0] <= NEIGHBOURS:
             return True
-        return len(match_descriptors(largest[pair[0]], largest[pair[1]])) >= options.preview_matches
+        return len(match_descriptors(largest[pair[0]], largest[pair[1]])) >= PREVIEW_MATCHES
 
     return [pair for pair, is_chosen in zip(pairs, pool.map(is_promising, pairs), strict=True) if is_chosen]
 

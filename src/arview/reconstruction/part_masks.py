@@ -53,19 +53,21 @@ class Silhouettes(Protocol):
         """
 
 
-@dataclass(frozen=True)
-class PlacingOptions:
-    """When photos are placed again by the part alone."""
-
-    min_placed: float = 0.7  # share of the photos; with fewer, the background may hold the others back
-    min_found: int = 3  # photos in which the part was found; fewer cannot be placed together
+MIN_PLACED = 0.7
+"""Share of the photos; with fewer, the background may hold the others back."""
+MIN_FOUND = 3
+"""Photos in which the part was found; fewer cannot be placed together."""
 
 
 def placed_with_silhouettes(
-    photos: Sequence[Photo], folder: Path, masks_folder: Path, silhouettes: Silhouettes,
-    place: Callable[[Sequence[Photo], Path], SparseModel], tell: Progress, can_place_again: bool = True,
-    options: PlacingOptions | None = None,
-) -> SparseModel:  # fmt: skip
+    photos: Sequence[Photo],
+    folder: Path,
+    masks_folder: Path,
+    silhouettes: Silhouettes,
+    place: Callable[[Sequence[Photo], Path], SparseModel],
+    tell: Progress,
+    can_place_again: bool = True,
+) -> SparseModel:
     """The placed photos with masks of the part; or without masks where the part is not found, with a remark.
 
     Args:
@@ -76,24 +78,22 @@ def placed_with_silhouettes(
         place: places photos and leaves files in a folder; raises CannotMeasureError.
         tell: called with (what, done, total).
         can_place_again: False where the poses were given.
-        options: see `PlacingOptions`.
 
     Raises:
         CannotMeasureError: the photos cannot be placed, neither whole nor by the part.
     """
-    options = options or PlacingOptions()
-    whole, failure = None, None
+    whole: SparseModel | CannotMeasureError
     try:
         whole = place(photos, folder)
     except CannotMeasureError as error:
         if not can_place_again:
             raise
-        failure = error
+        whole = error
     reason = "the whole photos could not be placed"
-    if whole is not None:
+    if isinstance(whole, SparseModel):
         found = silhouettes.at_poses(whole, masks_folder, tell)
         count = len(whole.photos)
-        is_enough = count >= options.min_placed * len(photos)
+        is_enough = count >= MIN_PLACED * len(photos)
         if found.masks and (is_enough or not can_place_again):
             return _with_remark(
                 with_masks_of(whole, found.masks),
@@ -101,36 +101,52 @@ def placed_with_silhouettes(
                 "whole photos",
             )
         reason = f"only {count} of {len(photos)} photos were placed whole" if found.masks else found.detail
-    if not can_place_again:
-        assert whole is not None
-        return _with_remark(whole, _not_made(reason))
-    return _placed_by_part(photos, folder, masks_folder, silhouettes, place, tell, options, whole, failure, reason)
+        if not can_place_again:
+            return _with_remark(whole, _not_made(reason))
+    return _placed_by_part(
+        photos,
+        folder,
+        masks_folder,
+        silhouettes=silhouettes,
+        place=place,
+        tell=tell,
+        whole=whole,
+        reason=reason,
+    )
 
 
 def _placed_by_part(
-    photos: Sequence[Photo], folder: Path, masks_folder: Path, silhouettes: Silhouettes,
-    place: Callable[[Sequence[Photo], Path], SparseModel], tell: Progress, options: PlacingOptions,
-    whole: SparseModel | None, failure: CannotMeasureError | None, reason: str,
-) -> SparseModel:  # fmt: skip
+    photos: Sequence[Photo],
+    folder: Path,
+    masks_folder: Path,
+    silhouettes: Silhouettes,
+    place: Callable[[Sequence[Photo], Path], SparseModel],
+    tell: Progress,
+    whole: SparseModel | CannotMeasureError,
+    reason: str,
+) -> SparseModel:
     """The photos placed by the pixels of the part alone; as they were placed before where that places no more."""
     found = silhouettes.in_photos(photos, masks_folder, tell)
     masked = [replace(photo, mask=found.masks[photo.name]) for photo in photos if photo.name in found.masks]
     problem = f"the part was found in {len(masked)} photos by itself" if masked else found.detail
-    if len(masked) >= options.min_found:
+    if len(masked) >= MIN_FOUND:
         try:
-            sparse = _placed_apart(masked, folder, place, 0 if whole is None else len(whole.photos))
+            sparse = _placed_apart(masked, folder, place, len(whole.photos) if isinstance(whole, SparseModel) else 0)
         except CannotMeasureError as error:
             problem = f"the part was found in {len(masked)} photos, which could not be placed by it alone: {error}"
         else:
-            left_out = [(one.name, "the part was not found in it, so that it has no silhouette (--masks auto)")
-                        for one in photos if one.name not in found.masks]  # fmt: skip
+            left_out = [
+                (one.name, "the part was not found in it, so that it has no silhouette (--masks auto)")
+                for one in photos
+                if one.name not in found.masks
+            ]
             sparse = replace(sparse, unplaced=(*sparse.unplaced, *left_out))
             remark = f"masks from the CAD's silhouette: placed by the part alone, because {reason}; from {found.detail}"
             wide = silhouettes.at_poses(sparse, masks_folder, tell)
             remark += f"; the cloud comes from {wide.detail}" if wide.masks else ""
             return _with_remark(with_masks_of(_unmasked(sparse), wide.masks), remark)
-    if whole is None:
-        raise CannotMeasureError(f"{failure}; --masks auto does not help: {problem}") from failure
+    if isinstance(whole, CannotMeasureError):
+        raise CannotMeasureError(f"{whole}; --masks auto does not help: {problem}") from whole
     return _with_remark(whole, _not_made(f"{reason}; {problem}"))
 
 

@@ -73,13 +73,15 @@ VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".m
 """Files with these suffixes are videos."""
 
 
+SCALE = CadOptions()
+
+
 @dataclass(frozen=True)
 class ReconstructOptions:
     """Options of the stages, and the last stage to run."""
 
     video: VideoIntakeOptions = field(default_factory=VideoIntakeOptions)
     sparse: SparseOptions = field(default_factory=SparseOptions)
-    scale: CadOptions = field(default_factory=CadOptions)
     sources: ScaleSources = field(default_factory=ScaleSources)
     dense: DenseOptions = field(default_factory=DenseOptions)
     poses: Path | None = None  # camera poses made elsewhere, see `given_poses`; None: structure from motion
@@ -165,9 +167,13 @@ class _ReconstructionRun:
     """One run, with its folder and options and the time of its stages."""
 
     def __init__(
-        self, folder: Path, part: Part | None, options: ReconstructOptions, tell: Progress,
+        self,
+        folder: Path,
+        part: Part | None,
+        options: ReconstructOptions,
+        tell: Progress,
         memory: SparseMemory | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.folder, self.part, self.options, self.tell, self.memory = folder, part, options, tell, memory
         self.stages = Stages(folder)
         self.seconds: dict[str, float] = {}
@@ -192,7 +198,7 @@ class _ReconstructionRun:
             sparse = self._sparse(intake.photos, key)
         if last >= 2 and sparse is not None:
             part_key = None if self.part is None else (self.part.model.source_hash, self.part.effective_view_range)
-            key = key_of(key, part_key, self.options.sources, self.options.scale)
+            key = key_of(key, part_key, self.options.sources, SCALE)
             scale = self._scale(intake.photos, sparse, key)
             sparse, cad = self._metric(sparse, scale)
             cover = self._coverage(sparse, cad)
@@ -200,7 +206,9 @@ class _ReconstructionRun:
             key = key_of(key, self.options.dense)
             cloud = self._dense(sparse, cad, key)
         quality = None if sparse is None else quality_of(sparse, cloud)
-        result = Reconstruction(self.folder, intake, sparse, scale, cloud, cover, quality, self.seconds)
+        result = Reconstruction(
+            self.folder, intake, sparse, scale=scale, cloud=cloud, coverage=cover, quality=quality, seconds=self.seconds
+        )
         write_json(self.folder / "reconstruction.json", summary(result))
         return result
 
@@ -263,9 +271,14 @@ class _ReconstructionRun:
         if silhouettes is None:
             return self._placed(photos, folder)
         return placed_with_silhouettes(
-            photos, folder, self.folder / "silhouettes", silhouettes, self._placed, self.tell,
+            photos,
+            folder,
+            self.folder / "silhouettes",
+            silhouettes,
+            self._placed,
+            self.tell,
             can_place_again=self.options.poses is None,
-        )  # fmt: skip
+        )
 
     def _placed(self, photos: Sequence[Photo], folder: Path) -> SparseModel:
         """The photos placed by structure from motion, or by the poses that were given."""
@@ -281,7 +294,7 @@ class _ReconstructionRun:
         if self.stages.is_finished("scale", key):
             return ScaleResult.from_provenance(json.loads(path.read_text(encoding="utf-8")))
         self._restart("scale")
-        scale = find_scale(sparse, self.part, self.options.sources, self.options.scale, progress=self.tell)
+        scale = find_scale(sparse, self.part, self.options.sources, SCALE, progress=self.tell)
         # The scale's file carries all doubts about the reconstruction to the measurement and its report.
         apart = groups_warning([photo.name for photo in photos], sparse.groups)
         scale = replace(scale, warnings=(*sparse.remarks, *((apart,) if apart else ()), *scale.warnings))
@@ -449,9 +462,14 @@ def summary(result: Reconstruction) -> dict[str, Any]:
 def camera_summary(camera: Any) -> dict[str, Any]:
     """A camera for JSON, in arview's own format."""
     return {
-        "width": camera.width, "height": camera.height, "fx": camera.fx, "fy": camera.fy, "cx": camera.cx,
-        "cy": camera.cy, "dist": camera.dist.tolist(),
-    }  # fmt: skip
+        "width": camera.width,
+        "height": camera.height,
+        "fx": camera.fx,
+        "fy": camera.fy,
+        "cx": camera.cx,
+        "cy": camera.cy,
+        "dist": camera.dist.tolist(),
+    }
 
 
 def pose_deviations(sparse: SparseModel) -> Array | None:

@@ -15,17 +15,18 @@ from arview.errors import InputError
 from arview.geometry import Array, apply
 from arview.rendering.rasterizer import rasterise
 
-
-@dataclass(frozen=True)
-class SeenOptions:
-    """When a photo counts as having seen a piece of surface."""
-
-    pieces_across: int = 60  # pieces along the part's diameter: fine enough for a boundary of a face half seen
-    max_pieces: int = 200_000  # of surface; larger models are divided less
-    max_side_px: int = 800  # of the rendered depth, in which hidden pieces are found
-    max_incidence_deg: float = 80.0  # between the normal and the ray; beyond it a surface is a line in the photo
-    depth_tolerance: float = 0.004  # relative depth by which a piece may lie behind the rendered surface
-    needed_photos: int = 2  # that determine a depth
+PIECES_ACROSS = 60
+"""Pieces along the part's diameter: fine enough for a boundary of a face half seen."""
+MAX_PIECES = 200_000
+"""Of surface; larger models are divided less."""
+MAX_SIDE_PX = 800
+"""Of the rendered depth, in which hidden pieces are found."""
+MAX_INCIDENCE_DEG = 80.0
+"""Between the normal and the ray; beyond it a surface is a line in the photo."""
+DEPTH_TOLERANCE = 0.004
+"""Relative depth by which a piece may lie behind the rendered surface."""
+NEEDED_PHOTOS = 2
+"""That determine a depth."""
 
 
 @dataclass(frozen=True)
@@ -62,31 +63,27 @@ class SeenSurface:
         return float(areas[mine & self.is_seen].sum()) / total if total > 0.0 else 0.0
 
 
-def seen_surface(
-    model: Model, views: Sequence[tuple[Camera, Array]], options: SeenOptions | None = None
-) -> SeenSurface:
+def seen_surface(model: Model, views: Sequence[tuple[Camera, Array]]) -> SeenSurface:
     """By geometry alone: pieces in the picture, towards the camera, and not hidden by others at their nominal places.
 
     Args:
         model: the nominal CAD.
         views: (camera, ``cam_from_model`` (4,4)) of each photo.
-        options: see `SeenOptions`.
 
     Raises:
         InputError: there are no views.
     """
-    options = options or SeenOptions()
     if not views:
         raise InputError("seen surface: no camera poses given; place the photos first")
     vertices, faces, owner = model.mesh
-    corners, parents = _pieces(vertices[faces], model.diameter_mm / options.pieces_across, options.max_pieces)
+    corners, parents = _pieces(vertices[faces], model.diameter_mm / PIECES_ACROSS, MAX_PIECES)
     middles = corners.mean(axis=1)
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     photos = np.zeros(len(corners), dtype=np.int32)
     for camera, pose in views:
-        photos += _sees(camera, pose, vertices, faces, middles, normals, options)
-    return SeenSurface(corners, owner[parents].astype(np.int32), photos, options.needed_photos)
+        photos += _sees(camera, pose, vertices, faces, middles, normals)
+    return SeenSurface(corners, owner[parents].astype(np.int32), photos, NEEDED_PHOTOS)
 
 
 def _pieces(corners: Array, size_mm: float, max_pieces: int) -> tuple[Array, NDArray[np.int64]]:
@@ -111,27 +108,38 @@ def _pieces(corners: Array, size_mm: float, max_pieces: int) -> tuple[Array, NDA
 
 
 def _sees(
-    camera: Camera, cam_from_model: Array, vertices: Array, faces: NDArray[np.int32], middles: Array, normals: Array,
-    options: SeenOptions,
-) -> NDArray[np.bool_]:  # fmt: skip
+    camera: Camera,
+    cam_from_model: Array,
+    vertices: Array,
+    faces: NDArray[np.int32],
+    middles: Array,
+    normals: Array,
+) -> NDArray[np.bool_]:
     """(P,) whether a photo shows the middle of each piece."""
-    scale = min(1.0, options.max_side_px / max(camera.width, camera.height))
+    scale = min(1.0, MAX_SIDE_PX / max(camera.width, camera.height))
     ideal = camera.without_distortion()
     small = ideal.scaled(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
     inverse_depth, _ = rasterise(
-        apply(cam_from_model, vertices), faces, small.fx, small.fy, small.cx, small.cy, small.width, small.height
+        apply(cam_from_model, vertices),
+        faces,
+        small.fx,
+        fy=small.fy,
+        cx=small.cx,
+        cy=small.cy,
+        width=small.width,
+        height=small.height,
     )
     in_cam = apply(cam_from_model, middles)
     depth = in_cam[:, 2]
     in_front = depth > 1e-6
     safe = np.where(in_front, depth, 1.0)
     cosine = -np.einsum("ij,ij->i", normals @ cam_from_model[:3, :3].T, in_cam) / np.linalg.norm(in_cam, axis=1)
-    seen = in_front & (cosine > math.cos(math.radians(options.max_incidence_deg)))
+    seen = in_front & (cosine > math.cos(math.radians(MAX_INCIDENCE_DEG)))
     column = np.rint(small.fx * in_cam[:, 0] / safe + small.cx)
     row = np.rint(small.fy * in_cam[:, 1] / safe + small.cy)
     seen &= (column >= 0) & (column < small.width) & (row >= 0) & (row < small.height)
     column, row = np.where(seen, column, 0).astype(int), np.where(seen, row, 0).astype(int)
     # A surface at a grazing angle changes its depth within the pixel that its middle falls into.
     slope = np.sqrt(1.0 - np.minimum(cosine, 1.0) ** 2) / np.maximum(cosine, 0.05)
-    tolerance = options.depth_tolerance + slope / small.fx
+    tolerance = DEPTH_TOLERANCE + slope / small.fx
     return np.asarray(seen & (depth * inverse_depth[row, column] < 1.0 + tolerance))

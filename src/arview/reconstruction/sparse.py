@@ -33,21 +33,37 @@ from arview.reconstruction.covariance import pose_covariance
 from arview.reconstruction.database import emptied, write_database, write_matches
 from arview.reconstruction.features import FeatureOptions, Features, find_all_features
 from arview.reconstruction.gpu.device import torch_device
-from arview.reconstruction.groups import GroupOptions, linked_groups
+from arview.reconstruction.groups import MIN_SHARED_POINTS, linked_groups
 from arview.reconstruction.matching import Matches, epipolar_inliers, match_along_lines, match_descriptors
 from arview.reconstruction.memory import SparseMemory, feature_prints
 from arview.reconstruction.pairs import (
     KnownPairs,
     Pair,
-    PairOptions,
     chosen_pairs,
     doubtful_pairs,
     pairs_in_common_view,
     write_pairs,
 )
-from arview.reconstruction.still import StillOptions, moved_matches, still_features, still_remark, without
+from arview.reconstruction.still import MAX_SHIFT_PX, moved_matches, still_features, still_remark, without
 from arview.reconstruction.types import Photo, SparseModel
 from arview.reconstruction.unplaced import unplaced_photos, why_nothing
+
+MAX_EPIPOLAR_PX = 4.0
+"""In the first pass, before the distortion is known."""
+BAND_PX = 2.0
+"""Half width of the band around epipolar lines in the second pass."""
+MIN_MATCHES = 15
+"""Pairs with fewer matches are due to chance."""
+MAX_ERROR_PX = 2.0
+"""Observations with larger errors are left out of the last adjustment."""
+LAST_TOLERANCE = 1e-5
+"""Relative decrease of the cost at which the last adjustment ends."""
+MIN_CENTRE_MOVE = 0.001
+"""Of the longer side; smaller moves of the principal point are not significant …."""
+MAX_CENTRE_MOVE = 0.05
+"""… and larger ones mean that the views do not determine it."""
+MIN_ANGLE_DEG = 1.5
+"""Between two rays to a point; smaller angles do not determine depth."""
 
 
 @dataclass(frozen=True)
@@ -56,26 +72,19 @@ class SparseOptions:
 
     features: FeatureOptions = field(default_factory=FeatureOptions)
     first_features: int = 2500  # per photo in the first pass; matching by appearance grows with the square
-    pairs: PairOptions = field(default_factory=PairOptions)
-    max_epipolar_px: float = 4.0  # in the first pass, before the distortion is known
-    band_px: float = 2.0  # half width of the band around epipolar lines in the second pass
-    min_matches: int = 15  # pairs with fewer matches are due to chance
-    max_error_px: float = 2.0  # observations with larger errors are left out of the last adjustment
-    last_tolerance: float = 1e-5  # relative decrease of the cost at which the last adjustment ends
-    min_centre_move: float = 0.001  # of the longer side; smaller moves of the principal point are not significant …
-    max_centre_move: float = 0.05  # … and larger ones mean that the views do not determine it
-    still: StillOptions = field(default_factory=StillOptions)
-    groups: GroupOptions = field(default_factory=GroupOptions)
-    min_angle_deg: float = 1.5  # between two rays to a point; smaller angles do not determine depth
     seed: int = 0
     threads: int = 0  # 0: all cores
     device: str = "auto"  # of features and matching: CUDA where torch finds it; cpu, or a torch device
 
 
 def reconstruct_sparse(
-    photos: Sequence[Photo], folder: Path, options: SparseOptions | None = None, progress: Progress | None = None,
-    known: KnownPairs | None = None, memory: SparseMemory | None = None,
-) -> SparseModel:  # fmt: skip
+    photos: Sequence[Photo],
+    folder: Path,
+    options: SparseOptions | None = None,
+    progress: Progress | None = None,
+    known: KnownPairs | None = None,
+    memory: SparseMemory | None = None,
+) -> SparseModel:
     """Reconstruct poses and points of the photos; COLMAP's database and model are left in ``folder``.
 
     Args:
@@ -95,11 +104,13 @@ def reconstruct_sparse(
     folder.mkdir(parents=True, exist_ok=True)
     known, memory = known or KnownPairs(), memory or SparseMemory()
     features, remarks = moving_features(photos, options, threads, tell, memory)
-    min_move_px = options.still.max_shift_px if remarks else 0.0
-    tried, pairs = match_by_appearance(photos, features, options, threads, tell, min_move_px, known, memory)
+    min_move_px = MAX_SHIFT_PX if remarks else 0.0
+    tried, pairs = match_by_appearance(
+        photos, features, options, threads=threads, tell=tell, min_move_px=min_move_px, known=known, memory=memory
+    )
     write_pairs(folder / "pairs.json", photos, tried)
     database_path = folder / "database.db"
-    write_database(database_path, photos, features, pairs, options.min_matches, options.seed)
+    write_database(database_path, photos, features, pairs, MIN_MATCHES, options.seed)
     models = _map(database_path, folder, options, len(photos), tell)
     if not models or max(model.num_reg_images() for model in models) < 3:
         raise CannotMeasureError("; ".join([why_nothing(photos, features, pairs), *remarks]))
@@ -107,7 +118,7 @@ def reconstruct_sparse(
     matches = match_all_along_lines(chosen, photos, features, options, threads, tell, min_move_px)
     write_matches(database_path, matches)
     chosen, adjuster = triangulate_and_adjust(chosen, database_path, folder, options, threads, tell)
-    sparse, groups = _finished(chosen, adjuster, photos, features, folder, options, threads, models)
+    sparse, groups = _finished(chosen, adjuster, photos, features, folder, threads, models)
     unplaced = unplaced_photos(photos, features, pairs, groups)
     return replace(sparse, unplaced=tuple(unplaced), groups=groups, remarks=tuple(remarks))
 
@@ -139,13 +150,13 @@ def reconstruct_from_poses(
     photos = [photo for photo, _ in posed]
     features, remarks = moving_features(photos, options, threads, tell, SparseMemory())
     database_path = folder / "database.db"
-    write_database(database_path, photos, features, {}, options.min_matches, options.seed)
+    write_database(database_path, photos, features, {}, MIN_MATCHES, options.seed)
     model = model_of_poses(posed)
     matches = match_all_along_lines(model, photos, features, options, threads, tell)
     write_matches(database_path, matches)
     try:
         model, adjuster = triangulate_and_adjust(model, database_path, folder, options, threads, tell)
-        sparse, groups = _finished(model, adjuster, photos, features, folder, options, threads, [])
+        sparse, groups = _finished(model, adjuster, photos, features, folder, threads, [])
     except (CannotMeasureError, ValueError, RuntimeError) as error:
         raise CannotMeasureError(
             "the given poses do not fit the photos: features along their epipolar lines give no points; check that the "
@@ -161,12 +172,11 @@ def _finished(
     photos: Sequence[Photo],
     features: Sequence[Features],
     folder: Path,
-    options: SparseOptions,
     threads: int,
     models: Sequence[Any],
 ) -> tuple[SparseModel, tuple[tuple[str, ...], ...]]:
     """The main group of an adjusted model, written to the folder, and the names of all groups."""
-    sparse, split = main_group(model, adjuster, photos, options, threads)
+    sparse, split = main_group(model, adjuster, photos, threads)
     color_points(model, features)
     model.write(str(emptied(folder / "model")))
     return sparse, _all_groups(sparse, split, models)
@@ -183,8 +193,8 @@ def moving_features(
         threads if device is None else 2,
         lambda i, n: tell("features", i, n),
     )
-    still = still_features(features, options.still, threads)
-    remark = still_remark(features, still, options.still)
+    still = still_features(features, threads)
+    remark = still_remark(features, still)
     return [without(one, dropped) for one, dropped in zip(features, still, strict=True)], [remark] if remark else []
 
 
@@ -192,9 +202,15 @@ def moving_features(
 
 
 def match_by_appearance(
-    photos: Sequence[Photo], features: Sequence[Features], options: SparseOptions, threads: int, tell: Progress,
-    min_move_px: float, known: KnownPairs, memory: SparseMemory,
-) -> tuple[list[Pair], dict[Pair, Matches]]:  # fmt: skip
+    photos: Sequence[Photo],
+    features: Sequence[Features],
+    options: SparseOptions,
+    threads: int,
+    tell: Progress,
+    min_move_px: float,
+    known: KnownPairs,
+    memory: SparseMemory,
+) -> tuple[list[Pair], dict[Pair, Matches]]:
     """The pairs that were matched, and the matches of those that have enough of them near epipolar lines.
 
     Before a still background, matches that move by less than ``min_move_px`` are left out.
@@ -208,9 +224,9 @@ def match_by_appearance(
         def find() -> Matches:
             matches = match_descriptors(one.descriptors[:count], other.descriptors[:count], device)
             matches = moved_matches(one, other, matches, min_move_px)
-            return epipolar_inliers(one, other, matches, options.max_epipolar_px)
+            return epipolar_inliers(one, other, matches, MAX_EPIPOLAR_PX)
 
-        key = (prints[pair[0]], prints[pair[1]], count, options.max_epipolar_px, min_move_px, device)
+        key = (prints[pair[0]], prints[pair[1]], count, MAX_EPIPOLAR_PX, min_move_px, device)
         return memory.matches(key, find)
 
     found: dict[Pair, Matches] = {}
@@ -218,15 +234,15 @@ def match_by_appearance(
 
     def match_all(pairs: list[Pair]) -> None:
         for done, (pair, matches) in enumerate(zip(pairs, pool.map(match, pairs), strict=True)):
-            if len(matches) >= options.min_matches:
+            if len(matches) >= MIN_MATCHES:
                 found[pair] = matches
             tell("matching", done + 1, len(pairs))
         tried.extend(pairs)
 
     # One BLAS thread for each product of descriptors, because the products already run in parallel.
     with ThreadPoolExecutor(threads) as pool, threadpool_limits(1, "blas"):
-        match_all(chosen_pairs(photos, features, options.pairs, known, pool))
-        match_all(doubtful_pairs(photos, features, options.pairs, known, tried, list(found), pool))
+        match_all(chosen_pairs(photos, features, known, pool))
+        match_all(doubtful_pairs(photos, features, known, tried, list(found), pool))
     return sorted(tried), {pair: found[pair] for pair in sorted(found)}
 
 
@@ -286,11 +302,11 @@ def match_all_along_lines(
         pair_of = (features[i], features[j])
 
         def find() -> Matches:
-            matches = match_along_lines((rays[i], rays[j]), focal, pair_of, essential, options.band_px, device)
+            matches = match_along_lines((rays[i], rays[j]), focal, pair_of, essential, BAND_PX, device)
             return moved_matches(*pair_of, matches, min_move_px)
 
         lenses = tuple((c.fx, c.fy, c.cx, c.cy, *c.dist.tolist()) for c in (cameras[i], cameras[j]))
-        key = (prints[i], prints[j], essential.tobytes(), lenses, options.band_px, min_move_px, device)
+        key = (prints[i], prints[j], essential.tobytes(), lenses, BAND_PX, min_move_px, device)
         return memory.matches(key, find)
 
     chosen = pairs_in_common_view(poses)
@@ -311,9 +327,14 @@ def cameras_and_poses(model: Any, photos: Sequence[Photo]) -> tuple[dict[int, Ca
 
 
 def triangulate_and_adjust(
-    model: Any, path: Path, folder: Path, options: SparseOptions, threads: int, tell: Progress,
+    model: Any,
+    path: Path,
+    folder: Path,
+    options: SparseOptions,
+    threads: int,
+    tell: Progress,
     keeps_centre: bool = False,
-) -> tuple[Any, Any]:  # fmt: skip
+) -> tuple[Any, Any]:
     """Points triangulated from all matches; then poses, points and intrinsics adjusted together.
 
     ``keeps_centre`` leaves principal points as an earlier adjustment has found them. Returns the model and the adjuster
@@ -331,15 +352,15 @@ def triangulate_and_adjust(
     if keeps_centre:
         adjust(model, threads, refines_centre=False, iterations=5)
     else:
-        refines_centre = adjust_with_centre(model, options, threads)
+        refines_centre = adjust_with_centre(model, threads)
     tell("adjusting", 2, 3)
-    pycolmap.ObservationManager(model).filter_all_points3D(options.max_error_px, options.min_angle_deg)
-    adjuster = adjust(model, threads, refines_centre=refines_centre, tolerance=options.last_tolerance)
+    pycolmap.ObservationManager(model).filter_all_points3D(MAX_ERROR_PX, MIN_ANGLE_DEG)
+    adjuster = adjust(model, threads, refines_centre=refines_centre, tolerance=LAST_TOLERANCE)
     tell("adjusting", 3, 3)
     return model, adjuster
 
 
-def adjust_with_centre(model: Any, options: SparseOptions, threads: int) -> bool:
+def adjust_with_centre(model: Any, threads: int) -> bool:
     """Adjust everything including the principal points, and restore those that moved less than their uncertainty.
 
     Returns whether the principal points are to be refined from here on. Correlated errors of features move a principal
@@ -349,9 +370,7 @@ def adjust_with_centre(model: Any, options: SparseOptions, threads: int) -> bool
     adjust(model, threads, refines_centre=True, iterations=12)
     moved = [float(np.abs(model.cameras[key].params[1:3] - centre).max()) for key, centre in before.items()]
     sizes = [max(model.cameras[key].width, model.cameras[key].height) for key in before]
-    if any(
-        options.min_centre_move < move / size < options.max_centre_move for move, size in zip(moved, sizes, strict=True)
-    ):
+    if any(MIN_CENTRE_MOVE < move / size < MAX_CENTRE_MOVE for move, size in zip(moved, sizes, strict=True)):
         return True
     for key, centre in before.items():
         model.cameras[key].params = np.concatenate(
@@ -360,9 +379,7 @@ def adjust_with_centre(model: Any, options: SparseOptions, threads: int) -> bool
     return False
 
 
-def main_group(
-    model: Any, adjuster: Any, photos: Sequence[Photo], options: SparseOptions, threads: int
-) -> tuple[SparseModel, list[list[str]]]:
+def main_group(model: Any, adjuster: Any, photos: Sequence[Photo], threads: int) -> tuple[SparseModel, list[list[str]]]:
     """The photos that are placed relative to each other, adjusted alone; and the names of the other groups.
 
     The mapper places photos by the first pass's matches; where few of them join two groups, the second pass may find
@@ -371,13 +388,13 @@ def main_group(
     split: list[list[str]] = []
     while True:
         sparse = sparse_model_of(model, photos)
-        if len(sparse.points_in_scan) < options.groups.min_shared_points:
+        if len(sparse.points_in_scan) < MIN_SHARED_POINTS:
             raise CannotMeasureError(
                 f"photos: the {len(sparse.photos)} that could be placed share no point seen from two sides; take more, "
                 "10 to 20 degrees apart, moving the camera sideways rather than turning it"
             )
         sparse = replace(sparse, pose_covariance=pose_covariance(sparse, model, adjuster))
-        kept, *others = linked_groups(sparse, options.groups)
+        kept, *others = linked_groups(sparse)
         if len(kept) < 3:
             raise CannotMeasureError(
                 f"photos: no three of the {len(sparse.photos)} share enough points to be placed relative to each "

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,35 +17,34 @@ from scipy.spatial import cKDTree
 from arview.reconstruction.features import Features
 from arview.reconstruction.matching import MAX_ANGLE_RAD, Matches
 
+MAX_SHIFT_PX = 1.5
+"""Of a still feature between two photos; those of a part that turns move by more."""
+COMPARED_PHOTOS = 8
+"""Others to which each photo is compared, spread over the set."""
+MIN_SHARE = 0.5
+"""Of these, in which the feature is found again at its place."""
+MIN_PHOTOS = 4
+"""Sets with fewer photos are left as they are."""
+MAX_SIZE_RATIO = 1.5
+"""Between the sizes of a feature and of the one found again."""
+USUAL_SHARE = 0.02
+"""Of a photo's features; fewer are chance, dirt on the lens or a watermark."""
+CANDIDATES = 4
+"""Nearest features that are compared with each feature."""
 
-@dataclass(frozen=True)
-class StillOptions:
-    """When a feature counts as still, and when a set of photos has a still background."""
 
-    max_shift_px: float = 1.5  # of a still feature between two photos; those of a part that turns move by more
-    compared_photos: int = 8  # others to which each photo is compared, spread over the set
-    min_share: float = 0.5  # of these, in which the feature is found again at its place
-    min_photos: int = 4  # sets with fewer photos are left as they are
-    max_size_ratio: float = 1.5  # between the sizes of a feature and of the one found again
-    usual_share: float = 0.02  # of a photo's features; fewer are chance, dirt on the lens or a watermark
-    candidates: int = 4  # nearest features that are compared with each feature
-
-
-def still_features(
-    features: Sequence[Features], options: StillOptions | None = None, threads: int = 1
-) -> list[NDArray[np.bool_]]:
+def still_features(features: Sequence[Features], threads: int = 1) -> list[NDArray[np.bool_]]:
     """For each photo, which of its features (N,) stand still in the picture."""
-    options = options or StillOptions()
-    if len(features) < options.min_photos:
+    if len(features) < MIN_PHOTOS:
         return [np.zeros(len(one), dtype=np.bool_) for one in features]
     trees = [cKDTree(one.points_px) if len(one) else None for one in features]
 
     def of_photo(index: int) -> NDArray[np.bool_]:
-        others = _spread_others(index, len(features), options.compared_photos)
+        others = _spread_others(index, len(features), COMPARED_PHOTOS)
         counts = np.zeros(len(features[index]))
         for other in others:
-            counts += _found_again(features[index], features[other], trees[other], options)
-        return np.asarray(counts >= max(2.0, options.min_share * len(others)))
+            counts += _found_again(features[index], features[other], trees[other])
+        return np.asarray(counts >= max(2.0, MIN_SHARE * len(others)))
 
     with ThreadPoolExecutor(max(1, threads)) as pool:
         return list(pool.map(of_photo, range(len(features))))
@@ -57,13 +55,10 @@ def without(features: Features, dropped: NDArray[np.bool_]) -> Features:
     return features.taken(~dropped)
 
 
-def still_remark(
-    features: Sequence[Features], still: Sequence[NDArray[np.bool_]], options: StillOptions | None = None
-) -> str:
+def still_remark(features: Sequence[Features], still: Sequence[NDArray[np.bool_]]) -> str:
     """What is said of the still features; empty if they are no more than chance or a watermark."""
-    options = options or StillOptions()
     shares = [float(np.mean(one)) for one in still if len(one)]
-    if not shares or float(np.median(shares)) < options.usual_share:
+    if not shares or float(np.median(shares)) < USUAL_SHARE:
         return ""
     return (
         f"{100 * float(np.median(shares)):.0f} % of the features stand still in the picture while others move: a "
@@ -85,19 +80,19 @@ def _spread_others(index: int, count: int, wanted: int) -> list[int]:
     return [others[int(k * step)] for k in range(min(wanted, len(others)))]
 
 
-def _found_again(ones: Features, others: Features, tree: cKDTree | None, options: StillOptions) -> NDArray[np.bool_]:
+def _found_again(ones: Features, others: Features, tree: cKDTree | None) -> NDArray[np.bool_]:
     """(N,) whether each feature is found in the other photo at the same pixel with the same appearance."""
     found = np.zeros(len(ones), dtype=np.bool_)
     if tree is None or len(ones) == 0:
         return found
-    count = min(options.candidates, len(others))
-    _, near = tree.query(ones.points_px, k=count, distance_upper_bound=options.max_shift_px)
+    count = min(CANDIDATES, len(others))
+    _, near = tree.query(ones.points_px, k=count, distance_upper_bound=MAX_SHIFT_PX)
     near = near.reshape(len(ones), count)
     for column in near.T:
         rows = np.flatnonzero(column < len(others))
         partners = column[rows]
         similarity = np.einsum("ij,ij->i", ones.descriptors[rows], others.descriptors[partners])
         ratio = np.abs(np.log(ones.sizes_px[rows] / np.maximum(others.sizes_px[partners], 1e-6)))
-        is_same = (similarity > np.cos(MAX_ANGLE_RAD)) & (ratio < np.log(options.max_size_ratio))
+        is_same = (similarity > np.cos(MAX_ANGLE_RAD)) & (ratio < np.log(MAX_SIZE_RATIO))
         found[rows[is_same]] = True
     return found

@@ -31,9 +31,12 @@ SPREAD_MIN_POINTS = 12
 
 @kernel
 def edge_spread(
-    smooth: NDArray[np.uint8], part: ViewArrays, cam_from_body: NDArray[np.float64], intrinsics: NDArray[np.float64],
-    step_mm: float
-) -> float:  # fmt: skip
+    smooth: NDArray[np.uint8],
+    part: ViewArrays,
+    cam_from_body: NDArray[np.float64],
+    intrinsics: NDArray[np.float64],
+    step_mm: float,
+) -> float:
     """Median standard deviation, px, of the blur of the part's edges at a pose; -1 where too few edges are seen.
 
     Args:

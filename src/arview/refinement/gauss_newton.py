@@ -16,9 +16,19 @@ from arview.core.kernel import kernel
 
 @kernel(inline=True)
 def add_line(
-    hessian: Any, gradient: Any, point: Any, cam_from_body: Any, x: Any, y: Any, z: Any, nu: Any, nv: Any,
-    intrinsics: Any, residual: Any, weight: Any
-) -> Any:  # fmt: skip
+    hessian: Any,
+    gradient: Any,
+    point: Any,
+    cam_from_body: Any,
+    x: Any,
+    y: Any,
+    z: Any,
+    nu: Any,
+    nv: Any,
+    intrinsics: Any,
+    residual: Any,
+    weight: Any,
+) -> Any:
     """Add weight · (Jᵀ J, Jᵀ r) of one residual along (nu, nv) to the system; only the lower triangle is filled.
 
     Args:
@@ -47,7 +57,7 @@ def add_line(
 @kernel
 def solve_step(
     hessian: NDArray[np.float64], gradient: NDArray[np.float64], damping: NDArray[np.float64]
-) -> NDArray[np.float64]:  # fmt: skip
+) -> NDArray[np.float64]:
     """Twist (6,) that solves (H + diag(damping)) x = -g by Cholesky decomposition; zeros for a singular system.
 
     ``hessian`` is given by its lower triangle.
@@ -83,7 +93,7 @@ def solve_step(
 @kernel
 def trust_in(
     hessian: NDArray[np.float64], gradient: NDArray[np.float64], squares: float, count: float, weight: float
-) -> float:  # fmt: skip
+) -> float:
     """Trust in one modality, 0–1, by the scatter of its residuals about its own optimum.
 
     Their variance relative to the one that they claim is the modality's variance component (Förstner, "Ein Verfahren

@@ -159,7 +159,7 @@ def run_stages(
 @kernel
 def _project_view(
     part: ViewArrays, pose: NDArray[np.float64], intrinsics: NDArray[np.float64], step_mm: float, stride: int
-) -> ViewLines:  # fmt: skip
+) -> ViewLines:
     """`ViewLines` of every ``stride``-th point of the nearest view at a pose."""
     view = nearest_view(part.directions, pose)
     first, last = part.contour_starts[view], part.contour_starts[view + 1]
@@ -178,7 +178,7 @@ def _project_view(
 @kernel
 def _measure_contour(
     image: NDArray[np.uint8], colors: ColorModel, view: ViewLines, focal: float, scale: int, is_used: bool
-) -> RegionLines:  # fmt: skip
+) -> RegionLines:
     """`RegionLines` of the contour; empty without the region modality."""
     if is_used:
         return measure_region(image, colors, view.contour_lines, view.contour_runs_mm, focal, scale)
@@ -188,7 +188,7 @@ def _measure_contour(
 @kernel
 def _measure_profiles(
     gray: NDArray[np.uint8], view: ViewLines, reach: int, step_px: float, threshold: float, is_used: bool
-) -> EdgeProfiles:  # fmt: skip
+) -> EdgeProfiles:
     """`EdgeProfiles` of the edges; empty without the edge modality."""
     if is_used:
         return measure_edges(gray, view.edge_lines, reach, step_px, threshold)
@@ -218,10 +218,17 @@ def _orthonormalize(pose: NDArray[np.float64]) -> None:
 
 @kernel
 def run_evidence(
-    image: NDArray[np.uint8], gray: NDArray[np.uint8], colors: ColorModel, has_colors: bool, part: ViewArrays,
-    cam_from_body: NDArray[np.float64], intrinsics: NDArray[np.float64], step_mm: float, edge_threshold: float,
-    tolerance_px: float
-) -> EvidenceTerms:  # fmt: skip
+    image: NDArray[np.uint8],
+    gray: NDArray[np.uint8],
+    colors: ColorModel,
+    has_colors: bool,
+    part: ViewArrays,
+    cam_from_body: NDArray[np.float64],
+    intrinsics: NDArray[np.float64],
+    step_mm: float,
+    edge_threshold: float,
+    tolerance_px: float,
+) -> EvidenceTerms:
     """`EvidenceTerms` of the picture for a pose; arguments as of `run_stages`.
 
     Args:
@@ -246,16 +253,27 @@ def run_evidence(
         terms = region_evidence(region, EVIDENCE_REGION_PX)
         region_support, region_information = terms.region_support, terms.region_information
     return EvidenceTerms(
-        edges.contour_support, edges.inner_support, edges.inner_share, edges.sharpness, region_support,
-        region_information, edges.points_in_picture, edges.scatter_px,
-    )  # fmt: skip
+        edges.contour_support,
+        edges.inner_support,
+        edges.inner_share,
+        edges.sharpness,
+        region_support,
+        region_information,
+        edges.points_in_picture,
+        edges.scatter_px,
+    )
 
 
 @kernel
 def run_edge_steps(
-    gray: NDArray[np.uint8], part: ViewArrays, cam_from_body: NDArray[np.float64], intrinsics: NDArray[np.float64],
-    step_mm: float, edge_threshold: float, tolerance_px: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:  # fmt: skip
+    gray: NDArray[np.uint8],
+    part: ViewArrays,
+    cam_from_body: NDArray[np.float64],
+    intrinsics: NDArray[np.float64],
+    step_mm: float,
+    edge_threshold: float,
+    tolerance_px: float,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Outline and design edges at a pose, see `EdgeSteps`; arguments as of `run_evidence`."""
     view = nearest_view(part.directions, cam_from_body)
     first, last = part.edge_starts[view], part.edge_starts[view + 1]
@@ -280,9 +298,15 @@ def run_edge_steps(
 
 @kernel
 def count_colors(
-    image: NDArray[np.uint8], bin_of: NDArray[np.int64], part: ViewArrays, cam_from_body: NDArray[np.float64],
-    intrinsics: NDArray[np.float64], step_mm: float, fore: NDArray[np.float64], back: NDArray[np.float64]
-) -> None:  # fmt: skip
+    image: NDArray[np.uint8],
+    bin_of: NDArray[np.int64],
+    part: ViewArrays,
+    cam_from_body: NDArray[np.float64],
+    intrinsics: NDArray[np.float64],
+    step_mm: float,
+    fore: NDArray[np.float64],
+    back: NDArray[np.float64],
+) -> None:
     """Add the colours inside and outside the contour at a pose to histograms of part and background (BINS³,)."""
     view = nearest_view(part.directions, cam_from_body)
     first, last = part.contour_starts[view], part.contour_starts[view + 1]
@@ -290,9 +314,7 @@ def count_colors(
         part.contour_points[first:last], part.contour_normals[first:last], False, cam_from_body, intrinsics, step_mm
     )
     runs_mm = part.contour_runs_mm[first:last]
-    add_histograms(
-        image, bin_of, lines, runs_mm, intrinsics[0], fore, back, HISTOGRAM_REACH_PX, HISTOGRAM_GAP_PX
-    )  # fmt: skip
+    add_histograms(image, bin_of, lines, runs_mm, intrinsics[0], fore, back, HISTOGRAM_REACH_PX, HISTOGRAM_GAP_PX)
 
 
 @kernel

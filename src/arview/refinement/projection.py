@@ -81,9 +81,13 @@ def project(x: float, y: float, z: float, intrinsics: NDArray[np.float64]) -> tu
 
 @kernel
 def project_lines(
-    points: NDArray[np.float64] | NDArray[np.float32], directions: NDArray[np.float64] | NDArray[np.float32],
-    across: bool, cam_from_body: NDArray[np.float64], intrinsics: NDArray[np.float64], step_mm: float
-) -> ProjectedLines:  # fmt: skip
+    points: NDArray[np.float64] | NDArray[np.float32],
+    directions: NDArray[np.float64] | NDArray[np.float32],
+    across: bool,
+    cam_from_body: NDArray[np.float64],
+    intrinsics: NDArray[np.float64],
+    step_mm: float,
+) -> ProjectedLines:
     """Project points with directions, see `ProjectedLines`.
 
     Args:

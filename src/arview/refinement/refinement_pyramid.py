@@ -17,6 +17,8 @@ from arview.refinement.refiner import NO_MATCHES, Appearance, PoseRefiner
 from arview.refinement.schedules import LAST_STAGES, Stage
 from arview.refinement.working_picture import (
     DEFAULT,
+    MARGIN_PX,
+    REACH,
     WorkingPicture,
     WorkingScaleOptions,
     matches_in,
@@ -53,7 +55,6 @@ class RefinementPyramid:
         self.scales = options.scales(refiner.radius_px(poses[-1]), spread_px)
         self._refiner = refiner
         self._image = image
-        self._options = options
         self._poses = list(poses)
         self._levels: dict[int, PictureRefiner] = {}
 
@@ -80,10 +81,8 @@ class RefinementPyramid:
     def level(self, number: int) -> PictureRefiner:
         """One of the pictures, the working picture being 0."""
         if number not in self._levels:
-            o, refiner, scale = self._options, self._refiner, self.scales[number]
-            window = window_around(
-                refiner.camera, self._poses, refiner.diameter_mm, o.margin_px / min(scale, 1.0), o.reach
-            )
+            refiner, scale = self._refiner, self.scales[number]
+            window = window_around(refiner.camera, self._poses, refiner.diameter_mm, MARGIN_PX / min(scale, 1.0), REACH)
             has_colors = number == 0 or not refiner.options.use_edge
             picture = working_picture(self._image, refiner.camera, scale, window, has_colors)
             self._levels[number] = PictureRefiner(refiner, picture)
@@ -99,7 +98,7 @@ class RefinementPyramid:
     def cover(self, poses: Sequence[Array]) -> None:
         """Make all pictures show the part at some other poses (4,4), too."""
         made = self._levels.values()
-        if not all(level.shows(pose, self.camera, self._options.reach) for level in made for pose in poses):
+        if not all(level.shows(pose, self.camera, REACH) for level in made for pose in poses):
             self._poses += poses
             self._levels.clear()
 
@@ -131,9 +130,14 @@ class RefinementPyramid:
             level = self.level(number)
             picture = level.picture
             cam_from_body, information = level.refiner.refine(
-                picture.image, picture.smooth, cam_from_body, stages if number == start else finer_stages, appearance,
-                level.matches(matches), use_region=picture.has_colors,
-            )  # fmt: skip
+                picture.image,
+                picture.smooth,
+                cam_from_body,
+                stages if number == start else finer_stages,
+                appearance,
+                level.matches(matches),
+                use_region=picture.has_colors,
+            )
         # An enlarged picture holds no more than the frame.
         return cam_from_body, information / max(self.scales[-1], 1.0) ** 2
 

@@ -30,6 +30,33 @@ NO_MATCHES = TextureMatches(np.empty((0, 3)), np.empty((0, 2)), np.empty(0), 0)
 """Matches of a frame in which texture is not used."""
 
 
+REGION_WEIGHT = 0.5
+"""Weight of colours; below 1, because neighbouring lines across the outline are correlated."""
+EDGE_WEIGHT = 1.0
+"""Weight of edges."""
+EDGE_SIGMA_PX = 0.7
+"""Standard deviation of a correct step from the edge of the CAD."""
+EDGE_THRESHOLD = 3.0
+"""Weakest step used, in grey levels over two pixels."""
+TEXTURE_SIGMA_PX = 0.9
+"""Standard deviation of a matched texture patch from its true position, including a share of the error of the pose at
+which it was learned."""
+ROTATION_SIGMA_RAD = 0.3
+"""Expected rotation error of a start, which sets the damping."""
+TRANSLATION_SIGMA = 0.3
+"""Expected translation error of a start, in diameters, which sets the damping."""
+MIN_INNER_SHARE = 0.3
+"""Share of design edges inside the outline below which colours get more weight."""
+PLAIN_REGION_GAIN = 6.0
+"""Extra weight of colours, as a multiple of ``REGION_WEIGHT``, for a part without inner edges."""
+MIN_HISTOGRAM_COUNT = 50
+"""Pixels needed on either side of the outline to learn colours."""
+SIZE_UNIT_PX = 80.0
+"""Half diameter in the picture for which the stages are made; a larger part widens them."""
+STEP_SHARE = 0.01
+"""Length, in diameters, by which the projections of normals and tangents are measured."""
+
+
 @dataclass(frozen=True)
 class RefinerOptions:
     """Options of the refinement.
@@ -37,36 +64,11 @@ class RefinerOptions:
     Attributes:
         use_region: use the colours along the outline.
         use_edge: use grey-level steps at outline and design edges.
-        region_weight: weight of colours; below 1, because neighbouring lines across the outline are correlated.
-        edge_weight: weight of edges.
-        edge_sigma_px: standard deviation of a correct step from the edge of the CAD.
-        edge_threshold: weakest step used, in grey levels over two pixels.
-        texture_sigma_px: standard deviation of a matched texture patch from its true position, including a share of the
-            error of the pose at which it was learned.
-        rotation_sigma_rad: expected rotation error of a start, which sets the damping.
-        translation_sigma: expected translation error of a start, in diameters, which sets the damping.
-        min_inner_share: share of design edges inside the outline below which colours get more weight.
-        plain_region_gain: extra weight of colours, as a multiple of ``region_weight``, for a part without inner edges.
-        min_histogram_count: pixels needed on either side of the outline to learn colours.
-        size_unit_px: half diameter in the picture for which the stages are made; a larger part widens them.
-        step_share: length, in diameters, by which the projections of normals and tangents are measured.
         shading: options of the shading modality.
     """
 
     use_region: bool = True
     use_edge: bool = True
-    region_weight: float = 0.5
-    edge_weight: float = 1.0
-    edge_sigma_px: float = 0.7
-    edge_threshold: float = 3.0
-    texture_sigma_px: float = 0.9
-    rotation_sigma_rad: float = 0.3
-    translation_sigma: float = 0.3
-    min_inner_share: float = 0.3
-    plain_region_gain: float = 6.0
-    min_histogram_count: int = 50
-    size_unit_px: float = 80.0
-    step_share: float = 0.01
     shading: ShadingOptions = field(default_factory=ShadingOptions)
 
 
@@ -116,27 +118,27 @@ class PoseRefiner:
         self.options = options or RefinerOptions()
         self.diameter_mm = part.views.diameter_mm
         self.intrinsics = intrinsics_of(camera)
-        self._step_mm = self.options.step_share * self.diameter_mm
+        self._step_mm = STEP_SHARE * self.diameter_mm
         o = self.options
         kinds = np.asarray(part.views.arrays["edge_kinds"])
         outline = int(np.count_nonzero(kinds & EDGE_CONTOUR))
         inner = int(np.count_nonzero(((kinds & EDGE_CONTOUR) == 0) & ((kinds & EDGE_SHARP) > 0)))
         inner_share = inner / max(outline + inner, 1)
         # Colours count more for a part with few design edges inside its outline.
-        plainness = max(0.0, 1.0 - inner_share / o.min_inner_share)
-        region_weight = o.region_weight * (1.0 + o.plain_region_gain * plainness)
+        plainness = max(0.0, 1.0 - inner_share / MIN_INNER_SHARE)
+        region_weight = REGION_WEIGHT * (1.0 + PLAIN_REGION_GAIN * plainness)
         self._weights = ModalityWeights(
             region=region_weight if o.use_region else 0.0,
-            edge=o.edge_weight if o.use_edge else 0.0,
-            edge_sigma_px=o.edge_sigma_px,
-            edge_threshold=o.edge_threshold,
-            texture_sigma_px=o.texture_sigma_px,
+            edge=EDGE_WEIGHT if o.use_edge else 0.0,
+            edge_sigma_px=EDGE_SIGMA_PX,
+            edge_threshold=EDGE_THRESHOLD,
+            texture_sigma_px=TEXTURE_SIGMA_PX,
         )
         self._weights_without_color = self._weights._replace(region=0.0)
         self._damping = np.concatenate(
             [
-                np.full(3, 1.0 / o.rotation_sigma_rad**2),
-                np.full(3, 1.0 / (o.translation_sigma * self.diameter_mm) ** 2),
+                np.full(3, 1.0 / ROTATION_SIGMA_RAD**2),
+                np.full(3, 1.0 / (TRANSLATION_SIGMA * self.diameter_mm) ** 2),
             ]
         )
 
@@ -157,7 +159,7 @@ class PoseRefiner:
         fore, back = np.zeros(BINS**3), np.zeros(BINS**3)
         count_colors(image, bin_of, self.part.arrays, cam_from_body, self.intrinsics, self._step_mm, fore, back)
         fore_count, back_count = fore.sum(), back.sum()
-        if min(fore_count, back_count) < self.options.min_histogram_count:
+        if min(fore_count, back_count) < MIN_HISTOGRAM_COUNT:
             return None
         return fore / fore_count, back / back_count
 
@@ -195,16 +197,25 @@ class PoseRefiner:
         """
         weights = self._weights if use_region and appearance.is_known else self._weights_without_color
         pose, information = run_stages(
-            image, gray, appearance.colors, self.part.arrays, cam_from_body, self.intrinsics, self._step_mm,
-            stage_table(stages), self._damping, weights, matches,
-        )  # fmt: skip
+            image,
+            gray,
+            appearance.colors,
+            self.part.arrays,
+            cam_from_body,
+            self.intrinsics,
+            self._step_mm,
+            stage_table(stages),
+            self._damping,
+            weights,
+            matches,
+        )
         return pose, information
 
     def refine_fresh(
         self, image: NDArray[np.uint8], gray: NDArray[np.uint8], cam_from_body: Array, stages: tuple[Stage, ...]
     ) -> Array:
         """Refine a pose (4,4) of unknown quality: colours are learned anew before every stage, without any memory."""
-        unit = max(1.0, self.radius_px(cam_from_body) / self.options.size_unit_px)
+        unit = max(1.0, self.radius_px(cam_from_body) / SIZE_UNIT_PX)
         for stage in stages:
             appearance = self.appearance_at(image, cam_from_body)
             cam_from_body, _ = self.refine(image, gray, cam_from_body, (stage.widened(unit),), appearance)
@@ -222,7 +233,7 @@ class PoseRefiner:
             ``cam_from_body`` (4,4) and information (6,6), unchanged where the part is not in the picture.
         """
         o = self.options.shading
-        crop = crop_for_shading(gray, self.camera, self.diameter_mm, cam_from_body, o)
+        crop = crop_for_shading(gray, self.camera, self.diameter_mm, cam_from_body)
         if crop is None:
             return cam_from_body, information
         part = self.part
@@ -241,9 +252,17 @@ class PoseRefiner:
     ) -> PoseEvidence:
         """Evidence of the picture for a pose (4,4); steps farther from an edge than the tolerance do not support it."""
         terms = run_evidence(
-            image, gray, appearance.colors, appearance.is_known, self.part.arrays, cam_from_body, self.intrinsics,
-            self._step_mm, self.options.edge_threshold, tolerance_px,
-        )  # fmt: skip
+            image,
+            gray,
+            appearance.colors,
+            appearance.is_known,
+            self.part.arrays,
+            cam_from_body,
+            self.intrinsics,
+            self._step_mm,
+            EDGE_THRESHOLD,
+            tolerance_px,
+        )
         return PoseEvidence(**terms._asdict())
 
     def edge_spread_px(self, gray: NDArray[np.uint8], cam_from_body: Array) -> float | None:
@@ -255,7 +274,12 @@ class PoseRefiner:
         """Outline and design edges at a pose (4,4), and the support of the picture for each of their points."""
         return EdgeSteps(
             *run_edge_steps(
-                gray, self.part.arrays, cam_from_body, self.intrinsics, self._step_mm, self.options.edge_threshold,
+                gray,
+                self.part.arrays,
+                cam_from_body,
+                self.intrinsics,
+                self._step_mm,
+                EDGE_THRESHOLD,
                 tolerance_px,
             )
-        )  # fmt: skip
+        )

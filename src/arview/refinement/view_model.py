@@ -16,7 +16,7 @@ from arview.core.kernel import kernel
 from arview.geometry import invert, rigid
 from arview.guideviews import GuideViewSet
 from arview.guideviews.mesh_edges import EDGE_CONTOUR, EDGE_SHARP
-from arview.refinement.modalities.shading import ShadingOptions, corner_normals, curved_share
+from arview.refinement.modalities.shading import corner_normals, curved_share
 from arview.refinement.projection import ViewArrays
 
 MIN_SEPARATION = 0.035
@@ -30,6 +30,8 @@ PARALLEL_COS = 0.7
 """Edges whose directions have a smaller cosine cross and are no neighbours."""
 END_ON = 0.02
 """Edges whose projected tangent is shorter than this are seen end-on and left out."""
+MIN_CURVED_SHARE = 0.2
+"""Share of curved surface that shading needs, because any light can explain the brightness of flat faces."""
 UNIT_16 = np.float32(1.0 / 32767.0)
 """Scale of the unit vectors that guide views store as 16-bit integers."""
 
@@ -66,7 +68,7 @@ class PartView:
             edge_kinds=np.array(raw["edge_kinds"]),
         )
         self.surface = views.surface
-        self.is_curved = curved_share(self.surface) >= ShadingOptions.min_curved_share
+        self.is_curved = curved_share(self.surface) >= MIN_CURVED_SHARE
         self.corner_normals = corner_normals(self.surface)
 
     @cached_property
@@ -87,18 +89,27 @@ def find_unresolvable(views: GuideViewSet) -> NDArray[np.bool_]:
     is_design = ((kinds & EDGE_SHARP) > 0) & ((kinds & EDGE_CONTOUR) == 0)
     unresolvable = np.zeros(len(kinds), dtype=np.bool_)
     _mark_unresolvable(
-        views.directions, raw["edge_start"], raw["edge_points"], raw["edge_tangents"] * UNIT_16, is_design,
-        np.float32(views.diameter_mm), unresolvable,
-    )  # fmt: skip
+        views.directions,
+        raw["edge_start"],
+        raw["edge_points"],
+        raw["edge_tangents"] * UNIT_16,
+        is_design,
+        np.float32(views.diameter_mm),
+        unresolvable,
+    )
     return unresolvable
 
 
 @kernel(fastmath=True)
 def _mark_unresolvable(
-    directions: NDArray[np.float64], starts: NDArray[np.int64], points: NDArray[np.float32],
-    tangents: NDArray[np.float32], is_design: NDArray[np.bool_], diameter_mm: float | np.float32,
-    unresolvable: NDArray[np.bool_]
-) -> None:  # fmt: skip
+    directions: NDArray[np.float64],
+    starts: NDArray[np.int64],
+    points: NDArray[np.float32],
+    tangents: NDArray[np.float32],
+    is_design: NDArray[np.bool_],
+    diameter_mm: float | np.float32,
+    unresolvable: NDArray[np.bool_],
+) -> None:
     """Mark edge points, see `find_unresolvable`. Edges are compared in the image plane of each view."""
     nearest, furthest = np.float32(SAME_LINE) * diameter_mm, np.float32(MIN_SEPARATION) * diameter_mm
     along = np.float32(MAX_ALONG) * diameter_mm

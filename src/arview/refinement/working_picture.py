@@ -22,6 +22,23 @@ from arview.geometry import Array
 from arview.refinement.modalities.edge import smoothed
 from arview.refinement.modalities.texture import TextureMatches
 
+SOFT_RADIUS_PX = 50.0
+"""A soft picture is not reduced below this half diameter, because too few points would be left."""
+MAX_SPREAD_PX = 1.5
+"""Standard deviation of the edges' blur in the working picture above which it is reduced further."""
+FINE_RADIUS_PX = 400.0
+"""Half the part's diameter in the finest picture."""
+MAX_FINE_SPREAD_PX = 2.5
+"""Standard deviation of the edges' blur in the finest picture above which it is smaller."""
+LEVEL_RATIO = 2.0
+"""Largest ratio of the scales of successive pictures, from which a pose is refined to the next."""
+STEPS_PER_OCTAVE = 2
+"""Scales are powers of two with this many steps in between, so that they seldom change."""
+REACH = 1.15
+"""Half size of the window, in half diameters of the part."""
+MARGIN_PX = 24.0
+"""Pixels of the reduced picture added to it."""
+
 
 @dataclass(frozen=True)
 class WorkingScaleOptions:
@@ -29,27 +46,11 @@ class WorkingScaleOptions:
 
     Attributes:
         radius_px: half the part's diameter in the working picture, in which poses are judged.
-        soft_radius_px: a soft picture is not reduced below this half diameter, because too few points would be left.
-        max_spread_px: standard deviation of the edges' blur in the working picture above which it is reduced further.
-        fine_radius_px: half the part's diameter in the finest picture.
-        max_fine_spread_px: standard deviation of the edges' blur in the finest picture above which it is smaller.
         max_enlargement: largest scale; more pixels than that only repeat what the camera saw.
-        level_ratio: largest ratio of the scales of successive pictures, from which a pose is refined to the next.
-        steps_per_octave: scales are powers of two with this many steps in between, so that they seldom change.
-        reach: half size of the window, in half diameters of the part.
-        margin_px: pixels of the reduced picture added to it.
     """
 
     radius_px: float = 100.0
-    soft_radius_px: float = 50.0
-    max_spread_px: float = 1.5
-    fine_radius_px: float = 400.0
-    max_fine_spread_px: float = 2.5
     max_enlargement: float = 4.0
-    level_ratio: float = 2.0
-    steps_per_octave: int = 2
-    reach: float = 1.15
-    margin_px: float = 24.0
 
     def scales(self, radius_px: float, spread_px: float = 0.0) -> tuple[float, ...]:
         """Scales of the pictures, from the working picture to the finest.
@@ -58,24 +59,24 @@ class WorkingScaleOptions:
             radius_px: half the part's diameter in the picture.
             spread_px: standard deviation of the blur of its edges in the picture; 0 where it is not known.
         """
-        finest = min(self.max_enlargement, self.fine_radius_px / radius_px)
-        if spread_px * finest > self.max_fine_spread_px:
-            finest = self.max_fine_spread_px / spread_px
+        finest = min(self.max_enlargement, FINE_RADIUS_PX / radius_px)
+        if spread_px * finest > MAX_FINE_SPREAD_PX:
+            finest = MAX_FINE_SPREAD_PX / spread_px
         first, last = np.log2(self.working_scale(radius_px, spread_px)), self._quantised(np.log2(finest))
-        count = max(0, int(np.ceil((last - first) / np.log2(self.level_ratio) - 1e-6)))
+        count = max(0, int(np.ceil((last - first) / np.log2(LEVEL_RATIO) - 1e-6)))
         between = [self._quantised(first + k * (last - first) / count) for k in range(1, count)]
         return tuple(float(2.0**x) for x in (first, *between, *([last] if count else [])))
 
     def working_scale(self, radius_px: float, spread_px: float = 0.0) -> float:
         """Scale of the working picture, at most 1; arguments as of `scales`."""
         scale = min(1.0, self.radius_px / radius_px)
-        if spread_px * scale > self.max_spread_px:
-            scale = max(self.max_spread_px / spread_px, min(scale, self.soft_radius_px / radius_px))
+        if spread_px * scale > MAX_SPREAD_PX:
+            scale = max(MAX_SPREAD_PX / spread_px, min(scale, SOFT_RADIUS_PX / radius_px))
         return float(2.0 ** self._quantised(np.log2(scale)))
 
     def _quantised(self, octaves: float) -> float:
         """The nearest scale of the series; both are logarithms to base 2."""
-        return float(np.round(octaves * self.steps_per_octave) / self.steps_per_octave)
+        return float(np.round(octaves * STEPS_PER_OCTAVE) / STEPS_PER_OCTAVE)
 
 
 DEFAULT = WorkingScaleOptions()
@@ -160,7 +161,9 @@ def working_picture(
     own = camera if is_whole else camera.cropped(left, top, right - left, bottom - top)
     if scale != 1.0:
         own = own.scaled(gray.shape[1], gray.shape[0])
-    return WorkingPicture(np.asarray(colors), smoothed(np.asarray(gray)), own, scale, left, top, right, bottom)
+    return WorkingPicture(
+        np.asarray(colors), smoothed(np.asarray(gray)), own, scale=scale, left=left, top=top, right=right, bottom=bottom
+    )
 
 
 def matches_in(picture: WorkingPicture, matches: TextureMatches) -> TextureMatches:
@@ -175,7 +178,7 @@ def matches_in(picture: WorkingPicture, matches: TextureMatches) -> TextureMatch
 
 
 def window_around(
-    camera: Camera, poses: Sequence[Array], diameter_mm: float, margin_px: float, reach: float = DEFAULT.reach
+    camera: Camera, poses: Sequence[Array], diameter_mm: float, margin_px: float, reach: float = REACH
 ) -> tuple[float, float, float, float] | None:
     """Borders of the window around a part at some poses (4,4) about its centre; None where one is not in front.
 

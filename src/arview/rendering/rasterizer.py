@@ -18,9 +18,21 @@ from arview.geometry import Array
 
 @kernel(inline=True)
 def _fill(
-    u0: Any, v0: Any, w0: Any, u1: Any, v1: Any, w1: Any, u2: Any, v2: Any, w2: Any, face: Any, x_low: Any,
-    y_low: Any, inverse_depth: Any, face_ids: Any
-) -> Any:  # fmt: skip
+    u0: Any,
+    v0: Any,
+    w0: Any,
+    u1: Any,
+    v1: Any,
+    w1: Any,
+    u2: Any,
+    v2: Any,
+    w2: Any,
+    face: Any,
+    x_low: Any,
+    y_low: Any,
+    inverse_depth: Any,
+    face_ids: Any,
+) -> Any:
     """Draw one projected triangle into the buffers; w is 1/z at the corners, (x_low, y_low) the first pixel."""
     height, width = inverse_depth.shape
     area = (u1 - u0) * (v2 - v0) - (u2 - u0) * (v1 - v0)
@@ -164,6 +176,15 @@ def rasterise(
         near_mm = min(1.0, max(0.01 * float(np.max(points_in_cam[:, 2], initial=0.0)), 1e-6))
     fill_buffers(
         np.ascontiguousarray(points_in_cam, dtype=np.float64),
-        faces, fx, fy, cx, cy, near_mm, origin[0], origin[1], inverse_depth, face_ids,
-    )  # fmt: skip
+        faces,
+        fx,
+        fy,
+        cx,
+        cy,
+        near_mm,
+        origin[0],
+        origin[1],
+        inverse_depth,
+        face_ids,
+    )
     return inverse_depth, face_ids

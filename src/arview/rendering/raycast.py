@@ -39,9 +39,13 @@ BINS = 12
 
 @kernel
 def _bound_node(
-    low: NDArray[np.float64], high: NDArray[np.float64], order: NDArray[np.int32], first: int, last: int,
-    bounds: NDArray[np.float64]
-) -> tuple[int, float, float]:  # fmt: skip
+    low: NDArray[np.float64],
+    high: NDArray[np.float64],
+    order: NDArray[np.int32],
+    first: int,
+    last: int,
+    bounds: NDArray[np.float64],
+) -> tuple[int, float, float]:
     """Write the box of some triangles into ``bounds`` (6,).
 
     Returns:
@@ -66,9 +70,18 @@ def _bound_node(
 
 @kernel
 def _best_plane(
-    low: NDArray[np.float64], high: NDArray[np.float64], order: NDArray[np.int32], first: int, last: int, axis: int,
-    origin: float, to_bin: float, box: NDArray[np.float64], sizes: NDArray[np.int64], cost: NDArray[np.float64]
-) -> int:  # fmt: skip
+    low: NDArray[np.float64],
+    high: NDArray[np.float64],
+    order: NDArray[np.int32],
+    first: int,
+    last: int,
+    axis: int,
+    origin: float,
+    to_bin: float,
+    box: NDArray[np.float64],
+    sizes: NDArray[np.int64],
+    cost: NDArray[np.float64],
+) -> int:
     """The last bin left of the plane of least cost; ``box`` (B,6), ``sizes`` (B,) and ``cost`` (B,) are scratch."""
     bins = box.shape[0]
     sizes[:] = 0
@@ -107,9 +120,17 @@ def _best_plane(
 
 @kernel
 def _partition(
-    low: NDArray[np.float64], high: NDArray[np.float64], order: NDArray[np.int32], first: int, last: int, axis: int,
-    origin: float, to_bin: float, plane: int, swap: NDArray[np.int32]
-) -> int:  # fmt: skip
+    low: NDArray[np.float64],
+    high: NDArray[np.float64],
+    order: NDArray[np.int32],
+    first: int,
+    last: int,
+    axis: int,
+    origin: float,
+    to_bin: float,
+    plane: int,
+    swap: NDArray[np.int32],
+) -> int:
     """Move the triangles left of a plane before the others, in stable order; returns the first index of the right."""
     left, right = first, 0
     for k in range(first, last):
@@ -127,7 +148,7 @@ def _partition(
 @kernel
 def _build(
     low: NDArray[np.float64], high: NDArray[np.float64], leaf_size: int
-) -> tuple[NDArray[np.float64], NDArray[np.int32], NDArray[np.int32]]:  # fmt: skip
+) -> tuple[NDArray[np.float64], NDArray[np.int32], NDArray[np.int32]]:
     """The hierarchy over the boxes of triangles.
 
     Args:
@@ -159,8 +180,31 @@ def _build(
         cut = (first + last) // 2
         if spread > 0.0:
             to_bin = BINS * (1.0 - 1e-9) / spread
-            plane = _best_plane(low, high, order, first, last, axis, origin, to_bin, box, sizes, cost)
-            left = _partition(low, high, order, first, last, axis, origin, to_bin, plane, swap)
+            plane = _best_plane(
+                low,
+                high,
+                order,
+                first=first,
+                last=last,
+                axis=axis,
+                origin=origin,
+                to_bin=to_bin,
+                box=box,
+                sizes=sizes,
+                cost=cost,
+            )
+            left = _partition(
+                low,
+                high,
+                order,
+                first=first,
+                last=last,
+                axis=axis,
+                origin=origin,
+                to_bin=to_bin,
+                plane=plane,
+                swap=swap,
+            )
             if first < left < last:
                 cut = left
         links[node, 0], links[node, 1] = nodes, 0
@@ -189,9 +233,8 @@ def _enter(bounds: Any, node: Any, ox: Any, oy: Any, oz: Any, ix: Any, iy: Any, 
 
 @kernel
 def cast_ray(
-    hierarchy: Hierarchy, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, limit: float,
-    any_hit: bool
-) -> tuple[float, int]:  # fmt: skip
+    hierarchy: Hierarchy, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, limit: float, any_hit: bool
+) -> tuple[float, int]:
     """The nearest hit of one ray.
 
     Args:
@@ -257,15 +300,25 @@ def cast_ray(
 
 @kernel
 def _cast_rays(
-    hierarchy: Hierarchy, origins: NDArray[np.float64], directions: NDArray[np.float64],
-    distances: NDArray[np.float64], faces: NDArray[np.int32]
-) -> None:  # fmt: skip
+    hierarchy: Hierarchy,
+    origins: NDArray[np.float64],
+    directions: NDArray[np.float64],
+    distances: NDArray[np.float64],
+    faces: NDArray[np.int32],
+) -> None:
     """Write the nearest hit of each ray (N,3) into ``distances`` (N,) and ``faces`` (N,)."""
     for i in range(origins.shape[0]):
         distance, face = cast_ray(
-            hierarchy, origins[i, 0], origins[i, 1], origins[i, 2],
-            directions[i, 0], directions[i, 1], directions[i, 2], 1e300, False,
-        )  # fmt: skip
+            hierarchy,
+            origins[i, 0],
+            origins[i, 1],
+            oz=origins[i, 2],
+            dx=directions[i, 0],
+            dy=directions[i, 1],
+            dz=directions[i, 2],
+            limit=1e300,
+            any_hit=False,
+        )
         distances[i] = distance if face >= 0 else np.inf
         faces[i] = face
 

@@ -57,9 +57,15 @@ class ZBufferRenderer:
         """The view of the model at a pose (4,4)."""
         camera = self.camera
         inverse_depth, face_ids = rasterise(
-            apply(cam_from_model, self._vertices), self._faces,
-            camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height,
-        )  # fmt: skip
+            apply(cam_from_model, self._vertices),
+            self._faces,
+            camera.fx,
+            fy=camera.fy,
+            cx=camera.cx,
+            cy=camera.cy,
+            width=camera.width,
+            height=camera.height,
+        )
         seen = face_ids >= 0
         depth = np.zeros(inverse_depth.shape, dtype=np.float32)
         depth[seen] = 1.0 / inverse_depth[seen]

@@ -11,11 +11,9 @@ if TYPE_CHECKING:
     from arview.report.decisions import update_reports
     from arview.report.evidence import ReportEvidence, gather
     from arview.report.make import make_report
-    from arview.report.page import ReportOptions
 
 __all__ = [
     "ReportEvidence",
-    "ReportOptions",
     "gather",
     "make_report",
     "update_reports",
@@ -23,7 +21,6 @@ __all__ = [
 
 _MODULE_OF = {
     "ReportEvidence": "arview.report.evidence",
-    "ReportOptions": "arview.report.page",
     "gather": "arview.report.evidence",
     "make_report": "arview.report.make",
     "update_reports": "arview.report.decisions",

@@ -82,11 +82,25 @@ def tolerance_chart(components: Sequence[ComponentDeviation]) -> str:
             low, high = _interval(row)
             share = row.distance_mm / row.tolerance_mm
             color = VERDICT_HEX[row.verdict]
-            axes.plot(np.clip([low / row.tolerance_mm, high / row.tolerance_mm], 0, limit), [place] * 2, color=color,
-                      linewidth=2.4, solid_capstyle="butt", alpha=0.55)  # fmt: skip
+            axes.plot(
+                np.clip([low / row.tolerance_mm, high / row.tolerance_mm], 0, limit),
+                [place] * 2,
+                color=color,
+                linewidth=2.4,
+                solid_capstyle="butt",
+                alpha=0.55,
+            )
             if share <= limit:
-                axes.plot([share], [place], _MARKER[row.verdict], color=color, markersize=6.5, markeredgewidth=0.6,
-                          markeredgecolor="white", clip_on=False)  # fmt: skip
+                axes.plot(
+                    [share],
+                    [place],
+                    _MARKER[row.verdict],
+                    color=color,
+                    markersize=6.5,
+                    markeredgewidth=0.6,
+                    markeredgecolor="white",
+                    clip_on=False,
+                )
             else:
                 axes.plot([limit], [place], ">", color=color, markersize=7, clip_on=False)
                 axes.text(
@@ -144,8 +158,16 @@ def budget_chart(components: Sequence[ComponentDeviation]) -> str:
         left = np.zeros(len(rows))
         for index, name in enumerate(shown):
             share = variances[name] / total
-            axes.barh(range(len(rows)), share, left=left, height=0.72, label=name, color=_SERIES[index],
-                      edgecolor="white", linewidth=0.5)  # fmt: skip
+            axes.barh(
+                range(len(rows)),
+                share,
+                left=left,
+                height=0.72,
+                label=name,
+                color=_SERIES[index],
+                edgecolor="white",
+                linewidth=0.5,
+            )
             left += share
         for place, row in enumerate(rows):
             axes.text(1.015, place, f"{row.uncertainty_mm:.3f}", va="center", fontsize=8.5)
@@ -176,8 +198,15 @@ def coverage_chart(directions: Array, sizes: NDArray[np.int64] | None = None) ->
         axes.scatter(azimuth, 90.0 - elevation, s=34, color=_SERIES[0], edgecolor="white", linewidth=0.6, zorder=3)
         if sizes is not None:
             for a, e, count in zip(azimuth, elevation, sizes, strict=True):
-                axes.annotate(str(int(count)), (a, 90.0 - e), xytext=(0, 6), textcoords="offset points", fontsize=7,
-                              color=MUTED, ha="center")  # fmt: skip
+                axes.annotate(
+                    str(int(count)),
+                    (a, 90.0 - e),
+                    xytext=(0, 6),
+                    textcoords="offset points",
+                    fontsize=7,
+                    color=MUTED,
+                    ha="center",
+                )
         rings = np.arange(0.0, 90.0 - lowest + 1, 30.0)[1:]
         axes.set_rlim(0.0, 90.0 - lowest)
         axes.set_rgrids(rings, [f"{90.0 - ring:.0f}°" for ring in rings], angle=22.5, fontsize=7.5, color=MUTED)
@@ -219,10 +248,16 @@ def datum_chart(datums: Sequence[DatumReport]) -> str:
     """Residuals of each datum about its own best fit and in the datum frame."""
     with figure(0.95 + 0.42 * len(datums)) as (made, axes):
         places = np.arange(len(datums))
-        axes.barh(places - 0.18, [d.residual_mm for d in datums], height=0.34, color=_SERIES[0],
-                  label="scatter about its own best fit")  # fmt: skip
-        axes.barh(places + 0.18, [d.rest_mm for d in datums], height=0.34, color="#c9d8e6",
-                  label="rms in the datum frame")  # fmt: skip
+        axes.barh(
+            places - 0.18,
+            [d.residual_mm for d in datums],
+            height=0.34,
+            color=_SERIES[0],
+            label="scatter about its own best fit",
+        )
+        axes.barh(
+            places + 0.18, [d.rest_mm for d in datums], height=0.34, color="#c9d8e6", label="rms in the datum frame"
+        )
         axes.set_yticks(places, [f"{d.label}  {d.feature}" for d in datums])
         axes.tick_params(axis="y", length=0, labelcolor=INK)
         axes.set_ylim(len(datums) - 0.4, -0.6)

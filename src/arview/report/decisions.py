@@ -13,12 +13,12 @@ from typing import Any
 from markupsafe import Markup
 
 from arview.core.atomic import write_file
-from arview.decisions import Decision, RecordState, log_of, state_of_record
-from arview.decisions.folder import first_inspection, photo_path, rechecks_of
-from arview.decisions.table import decision_word
 from arview.errors import InputError
 from arview.inspection import ComponentDeviation, load_inspection
 from arview.inspection.fingerprint import fingerprint_of_file
+from arview.quality.decisions import Decision, RecordState, log_of, state_of_record
+from arview.quality.decisions.folder import first_inspection, photo_path, rechecks_of
+from arview.quality.decisions.table import decision_word
 from arview.report.evidence import ReportEvidence
 from arview.report.formatting import short_text, verdict_word
 from arview.report.rework import embedded_picture
@@ -98,8 +98,10 @@ def _rendered(source: Path, state: RecordState) -> dict[str, Any]:
     entries = log_of(source).entries()
     rows = [_row(one, source) for one in entries if one.kind != "tick"]
     made = {"record": module.record(state), "decisions": module.section(state, rows, _ticks(entries), _checked(state))}
-    return {f"{name}_html": Markup("").join((Markup(_marks(name)[0]), made[name], Markup(_marks(name)[1])))
-            for name in _PARTS}  # fmt: skip
+    return {
+        f"{name}_html": Markup("").join((Markup(_marks(name)[0]), made[name], Markup(_marks(name)[1])))
+        for name in _PARTS
+    }
 
 
 def _checked(state: RecordState) -> list[dict[str, str]]:

@@ -70,13 +70,19 @@ def gather(
     distances = _distances(inspection, source, part, cloud, absent)
     if cloud is None and distances is None:
         absent.setdefault("cloud", "This inspection has no cloud.")
-    return ReportEvidence(inspection, source, sha256, part, sparse, cloud, distances, absent)
+    return ReportEvidence(
+        inspection, source, sha256, part=part, sparse=sparse, cloud=cloud, distances=distances, absent=absent
+    )
 
 
 def _reconstruction(
-    inspection: Inspection, source: Path, part: Part | None, folder: str | Path | None, photos: str | Path | None,
+    inspection: Inspection,
+    source: Path,
+    part: Part | None,
+    folder: str | Path | None,
+    photos: str | Path | None,
     absent: dict[str, str],
-) -> tuple[SparseModel | None, DenseCloud | None]:  # fmt: skip
+) -> tuple[SparseModel | None, DenseCloud | None]:
     """Photos and cloud of the reconstruction, transformed to the datum frame."""
     from arview.measurement.folder import in_model_frame, read_folder
 

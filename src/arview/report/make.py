@@ -13,7 +13,7 @@ from arview.core.extras import require
 from arview.core.progress import Progress
 from arview.errors import InputError, MissingDependencyError
 from arview.report.evidence import ReportEvidence, gather
-from arview.report.page import ReportOptions, build_context, render
+from arview.report.page import build_context, render
 
 PANGO_INSTALL_COMMAND = (
     "apt-get install -y --no-install-recommends libpango-1.0-0 libpangoft2-1.0-0 libharfbuzz-subset0"
@@ -21,10 +21,15 @@ PANGO_INSTALL_COMMAND = (
 
 
 def make_report(
-    inspection: str | Path, html: str | Path | None = None, pdf: str | Path | None = None, part: Part | None = None,
-    *, folder: str | Path | None = None, photos: str | Path | None = None, options: ReportOptions | None = None,
+    inspection: str | Path,
+    html: str | Path | None = None,
+    pdf: str | Path | None = None,
+    part: Part | None = None,
+    *,
+    folder: str | Path | None = None,
+    photos: str | Path | None = None,
     progress: Progress | None = None,
-) -> ReportEvidence:  # fmt: skip
+) -> ReportEvidence:
     """Write the report of an inspection as one self-contained HTML file, as PDF, or both.
 
     Args:
@@ -34,7 +39,6 @@ def make_report(
         part: the part that was inspected; without it the report has no pictures and no CAD model.
         folder: folder of a reconstruction; default: the folder of the inspection, if it contains one.
         photos: folder of the photos if they were moved.
-        options: extent of the report.
         progress: called with (step, done, total).
 
     Returns:
@@ -55,7 +59,7 @@ def make_report(
         _weasyprint()
     report_progress("reading", 0, 1)
     evidence = gather(inspection, part, folder, photos)
-    context = build_context(evidence, options or ReportOptions(), report_progress)
+    context = build_context(evidence, report_progress)
     if html is not None:
         write_file(Path(html), render(context, for_print=False).encode("utf-8"))
     if pdf is not None:
@@ -69,9 +73,11 @@ def pdf_of(page: str, evidence: ReportEvidence) -> bytes:
     """The page as PDF/A-3 with the inspection attached."""
     weasyprint = _weasyprint()
     attachment = weasyprint.Attachment(
-        string=evidence.source.read_bytes(), name=evidence.source.name, description="the inspection (arview)",
+        string=evidence.source.read_bytes(),
+        name=evidence.source.name,
+        description="the inspection (arview)",
         relationship="Source",
-    )  # fmt: skip
+    )
     return bytes(weasyprint.HTML(string=page).write_pdf(attachments=[attachment], pdf_variant="pdf/a-3u"))
 
 

@@ -6,7 +6,6 @@ import base64
 import hashlib
 import io
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from importlib import resources
 from typing import Any
@@ -38,9 +37,9 @@ from arview.report.formatting import (
     zone_text,
 )
 from arview.report.halves import repeatability_context
-from arview.report.pictures import Crop, CropOptions, Gallery, RgbImage, make_gallery, overview
+from arview.report.pictures import Crop, Gallery, RgbImage, make_gallery, overview
 from arview.report.rework import rework_context
-from arview.report.scene import SceneOptions, make_scene, scene_json
+from arview.report.scene import make_scene, scene_json
 from arview.version import __version__
 
 _FONTS = (("Inter", "400", "inter-400"), ("Inter", "600", "inter-600"), ('"Inter Greek"', "400", "inter-greek-400"))
@@ -51,25 +50,19 @@ _PRINT_SCRIPT = (
 _EXAGGERATIONS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 
 
-@dataclass(frozen=True)
-class ReportOptions:
-    """Extent and quality of a report."""
-
-    crops: CropOptions = field(default_factory=CropOptions)
-    scene: SceneOptions = field(default_factory=SceneOptions)
-    jpeg_quality: int = 84  # quality of the pictures, without visible artefacts at the size of the page
-    map_limit_mm: float = 1.0  # end of the colour scale of the distance map
+JPEG_QUALITY = 84
+"""Quality of the pictures, without visible artefacts at the size of the page."""
+MAP_LIMIT_MM = 1.0
+"""End of the colour scale of the distance map."""
 
 
-def build_context(evidence: ReportEvidence, options: ReportOptions, progress: Progress) -> dict[str, Any]:
+def build_context(evidence: ReportEvidence, progress: Progress) -> dict[str, Any]:
     """The context of the template, for screen and print."""
     inspection, part, sparse = evidence.inspection, evidence.part, evidence.sparse
     model = None if part is None else part.model
     gallery = Gallery({}, (), ())
     if model is not None and sparse is not None:
-        gallery = make_gallery(
-            inspection, model, sparse, options.crops, lambda done, total: progress("pictures", done, total)
-        )
+        gallery = make_gallery(inspection, model, sparse, lambda done, total: progress("pictures", done, total))
     progress("charts", 0, 1)
     whole = overall_verdict(inspection)
     title = f"{inspection.part} {inspection.serial}".strip()
@@ -93,22 +86,22 @@ def build_context(evidence: ReportEvidence, options: ReportOptions, progress: Pr
         "provenance": explanations.provenance(inspection, evidence.part),
         "uncertainty_lead": explanations.uncertainty(inspection),
     }
-    context |= _components(evidence) | _findings(evidence, gallery, options)
-    context |= _distance_map(evidence, options) | _budget(inspection) | _datums(inspection)
+    context |= _components(evidence) | _findings(evidence, gallery)
+    context |= _distance_map(evidence) | _budget(inspection) | _datums(inspection)
     context |= repeatability_context(inspection) | decisions_context(evidence)
     progress("rework", 0, 1)
     context |= rework_context(evidence)
     progress("photos", 0, 1)
     context |= _photos(evidence)
     if model is not None:
-        context["overview"] = _embedded(overview(inspection, model, sparse), options.jpeg_quality)
+        context["overview"] = _embedded(overview(inspection, model, sparse), JPEG_QUALITY)
         context["overview_caption"] = (
             "Components at their design positions over a photo; exaggerated arrows point to the measured positions."
             if sparse is not None
             else "The nominal part; exaggerated arrows point to the measured positions."
         )
     progress("3D view", 0, 1)
-    context |= _viewer(evidence, options)
+    context |= _viewer(evidence)
     context["charts"] = _charts(evidence) | context.pop("photo_charts")
     return context
 
@@ -211,13 +204,13 @@ def _center(one: ComponentDeviation, evidence: ReportEvidence) -> Array | None:
     return None
 
 
-def _findings(evidence: ReportEvidence, gallery: Gallery, options: ReportOptions) -> dict[str, Any]:
+def _findings(evidence: ReportEvidence, gallery: Gallery) -> dict[str, Any]:
     inspection = evidence.inspection
     order = {one.name: index for index, one in enumerate(inspection.components)}
     has_photos = evidence.part is not None and evidence.sparse is not None
     findings, passed = [], []
     for one in by_urgency(inspection):
-        crops = [_crop(crop, options) for crop in gallery.components.get(one.name, ())]
+        crops = [_crop(crop) for crop in gallery.components.get(one.name, ())]
         entry = {"name": one.name, "verdict": one.verdict.value, "word": verdict_word(one)}
         if one.verdict is Verdict.PASS:
             if crops:
@@ -236,7 +229,7 @@ def _findings(evidence: ReportEvidence, gallery: Gallery, options: ReportOptions
             }
         )
     foreign = [
-        {"text": foreign_text(one), "crops": [_crop(crop, options, "its box") for crop in crops]}
+        {"text": foreign_text(one), "crops": [_crop(crop, "its box") for crop in crops]}
         for one, crops in zip(
             inspection.foreign_objects, gallery.foreign or [()] * len(inspection.foreign_objects), strict=True
         )
@@ -254,16 +247,16 @@ def _own_notes(details: Details) -> list[str]:
     return [note for note in details.notes if note not in of_methods]
 
 
-def _crop(crop: Crop, options: ReportOptions, what: str = "overlay: design position") -> dict[str, Any]:
+def _crop(crop: Crop, what: str = "overlay: design position") -> dict[str, Any]:
     arrow = "" if crop.arrow_scale is None else f"; arrow × {crop.arrow_scale:g}"
     caption = f"{crop.photo}; {what}{arrow}"
-    return {"photo": crop.photo, "caption": caption, **_embedded(crop.image, options.jpeg_quality)}
+    return {"photo": crop.photo, "caption": caption, **_embedded(crop.image, JPEG_QUALITY)}
 
 
-def _distance_map(evidence: ReportEvidence, options: ReportOptions) -> dict[str, Any]:
+def _distance_map(evidence: ReportEvidence) -> dict[str, Any]:
     report = evidence.inspection.distance_map
     context: dict[str, Any] = {
-        "map_limit": f"{options.map_limit_mm:g}",
+        "map_limit": f"{MAP_LIMIT_MM:g}",
     }
     if report is not None:
         context["reach"] = f"{report.reach_mm:g}"
@@ -280,8 +273,8 @@ def _distance_map(evidence: ReportEvidence, options: ReportOptions) -> dict[str,
         ]
     if evidence.distances is not None:
         width, legend = 1300, 110  # map_picture draws its legend there; the page has its own
-        image = map_picture(evidence.distances, limit_mm=options.map_limit_mm, width=width, height=900)
-        context["map"] = _embedded(_trimmed(image[:, : width - legend]), options.jpeg_quality)
+        image = map_picture(evidence.distances, limit_mm=MAP_LIMIT_MM, width=width, height=900)
+        context["map"] = _embedded(_trimmed(image[:, : width - legend]), JPEG_QUALITY)
     return context
 
 
@@ -408,9 +401,9 @@ def _charts(evidence: ReportEvidence) -> dict[str, Markup]:
     return {name: Markup(text) for name, text in made.items()}
 
 
-def _viewer(evidence: ReportEvidence, options: ReportOptions) -> dict[str, Any]:
+def _viewer(evidence: ReportEvidence) -> dict[str, Any]:
     model = None if evidence.part is None else evidence.part.model
-    scene = make_scene(evidence.inspection, model, evidence.cloud, evidence.distances, options.scene, evidence.sparse)
+    scene = make_scene(evidence.inspection, model, evidence.cloud, evidence.distances, evidence.sparse)
     if scene is None:
         return {"scene": ""}
     cloud = scene.get("cloud", {})
@@ -427,8 +420,11 @@ def _viewer(evidence: ReportEvidence, options: ReportOptions) -> dict[str, Any]:
         lead.append(evidence.absent.get("cloud", "There is no cloud."))
     if has_uncovered:
         lead.append("Hatched: surfaces that no two photos saw; the CAD model stands in for them.")
-    modes = [(name, text) for name, text in (("photo", "photos"), ("distance", "distance to the CAD model"))
-             if ("colors" if name == "photo" else "distances") in cloud]  # fmt: skip
+    modes = [
+        (name, text)
+        for name, text in (("photo", "photos"), ("distance", "distance to the CAD model"))
+        if ("colors" if name == "photo" else "distances") in cloud
+    ]
     return {
         "scene": Markup(scene_json(scene)),
         "scene_lead": " ".join(lead),

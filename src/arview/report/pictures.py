@@ -29,17 +29,19 @@ _FOREIGN_RGB = (255, 214, 10)
 _BACKGROUND = (52, 58, 68)
 
 
-@dataclass(frozen=True)
-class CropOptions:
-    """Size and selection of the crops."""
-
-    width_px: int = 720  # size of a crop, sharp on a page with two of them side by side
-    height_px: int = 540
-    share: float = 0.55  # share of the crop that the component fills; the rest shows its surroundings
-    min_px: int = 160  # smallest width of the region of the photo; smaller ones would be blurred
-    arrow_share: float = 0.3  # largest length of the arrow as a share of the width of the crop
-    apart_deg: float = 40.0  # smallest angle between the lines of sight of two crops
-    max_px: int = 400  # longer side of the renderings that determine the visibility
+WIDTH_PX = 720
+"""Size of a crop, sharp on a page with two of them side by side."""
+HEIGHT_PX = 540
+SHARE = 0.55
+"""Share of the crop that the component fills; the rest shows its surroundings."""
+MIN_PX = 160
+"""Smallest width of the region of the photo; smaller ones would be blurred."""
+ARROW_SHARE = 0.3
+"""Largest length of the arrow as a share of the width of the crop."""
+APART_DEG = 40.0
+"""Smallest angle between the lines of sight of two crops."""
+MAX_PX = 400
+"""Longer side of the renderings that determine the visibility."""
 
 
 @dataclass(frozen=True)
@@ -73,21 +75,21 @@ class Gallery:
 
 
 def make_gallery(
-    inspection: Inspection, model: Model, sparse: SparseModel, options: CropOptions | None = None,
+    inspection: Inspection,
+    model: Model,
+    sparse: SparseModel,
     progress: StepProgress | None = None,
-) -> Gallery:  # fmt: skip
+) -> Gallery:
     """Crops from the photos that show each object best: one for components that passed, else two.
 
     Args:
         inspection: the inspection, in the frame of ``sparse``.
         model: the CAD model.
         sparse: photos and their poses, mm.
-        options: see `CropOptions`.
         progress: called with (photos done, number of photos).
     """
-    options = options or CropOptions()
     report_progress = progress or (lambda done, total: None)
-    ranking = _PhotoRanking(model, sparse.photos, options)
+    ranking = _PhotoRanking(model, sparse.photos)
     wanted: list[tuple[str | int, list[int]]] = [
         (one.name, ranking.best_of(one, 1 if one.verdict is Verdict.PASS else 2)) for one in inspection.components
     ]
@@ -113,9 +115,9 @@ def make_gallery(
             if isinstance(key, str):
                 deviation = inspection.find(key)
                 assert deviation is not None
-                crops[key, index] = _component_crop(deviation, inspection, model, photo, image, options)
+                crops[key, index] = _component_crop(deviation, inspection, model, photo, image)
             else:
-                crops[key, index] = _foreign_crop(inspection.foreign_objects[key], photo, image, options)
+                crops[key, index] = _foreign_crop(inspection.foreign_objects[key], photo, image)
     report_progress(len(by_photo), len(by_photo))
     found = {key: tuple(crops[key, photo] for photo in photos if (key, photo) in crops) for key, photos in wanted}
     return Gallery(
@@ -178,13 +180,13 @@ def _whole_pose(model: Model, camera: Camera) -> Array:
 class _PhotoRanking:
     """How many pixels of what each photo shows."""
 
-    def __init__(self, model: Model, photos: Sequence[PosedPhoto], options: CropOptions) -> None:
-        self.model, self.photos, self.options = model, photos, options
+    def __init__(self, model: Model, photos: Sequence[PosedPhoto]) -> None:
+        self.model, self.photos = model, photos
         self.centres = np.array([photo.centre_in_scan for photo in photos]).reshape(-1, 3)
         self.pixels = np.zeros((len(photos), len(model.components)))
         self._depths: list[tuple[Camera, NDArray[np.float32]]] = []
         for row, photo in enumerate(photos):
-            scale = min(1.0, options.max_px / max(photo.camera.width, photo.camera.height))
+            scale = min(1.0, MAX_PX / max(photo.camera.width, photo.camera.height))
             small = photo.camera.scaled(round(photo.camera.width * scale), round(photo.camera.height * scale))
             drawn = ZBufferRenderer(model, small).render(photo.cam_from_scan)
             ids = drawn.component_ids
@@ -235,7 +237,7 @@ class _PhotoRanking:
         score = score.copy()
         while len(chosen) < count and score.max(initial=0.0) > 0.0:
             chosen.append(int(np.argmax(score)))
-            score[rays @ rays[chosen[-1]] > np.cos(np.deg2rad(self.options.apart_deg))] = 0.0
+            score[rays @ rays[chosen[-1]] > np.cos(np.deg2rad(APART_DEG))] = 0.0
         return chosen
 
 
@@ -249,17 +251,20 @@ def _corners(bounds: Array) -> Array:
 
 
 def _component_crop(
-    deviation: ComponentDeviation, inspection: Inspection, model: Model, photo: PosedPhoto, image: RgbImage,
-    options: CropOptions,
-) -> Crop:  # fmt: skip
+    deviation: ComponentDeviation,
+    inspection: Inspection,
+    model: Model,
+    photo: PosedPhoto,
+    image: RgbImage,
+) -> Crop:
     """A crop with the overlay of a component at its design position and an arrow to its measured position."""
     bounds = model.component(deviation.name).bounds_in_model
-    crop, camera = _cut(image, photo, _corners(bounds), options)
+    crop, camera = _cut(image, photo, _corners(bounds))
     scale: float | None = None
     displacement = arrow_in_model(deviation)
     if displacement is not None and deviation.verdict is not Verdict.PASS:
         depth = float(apply(photo.cam_from_scan, bounds.mean(axis=0)[None])[0, 2])
-        longest_mm = options.arrow_share * camera.width * depth / camera.fx
+        longest_mm = ARROW_SHARE * camera.width * depth / camera.fx
         length_mm = float(np.linalg.norm(displacement))
         scale = float(max((s for s in _ROUND_SCALES if s * length_mm <= longest_mm), default=1))
     alone = replace(inspection, components=(deviation,), foreign_objects=())
@@ -276,10 +281,10 @@ def _component_crop(
     return Crop(picture, photo.name, scale)
 
 
-def _foreign_crop(one: ForeignReport, photo: PosedPhoto, image: RgbImage, options: CropOptions) -> Crop:
+def _foreign_crop(one: ForeignReport, photo: PosedPhoto, image: RgbImage) -> Crop:
     """A crop with the bounding box of a foreign object."""
     corners = np.array(one.center_mm) + 0.5 * np.array(one.size_mm) * _UNIT_CORNERS
-    crop, camera = _cut(image, photo, corners, options)
+    crop, camera = _cut(image, photo, corners)
     pixels = camera.project(apply(photo.cam_from_scan, corners))
     for a, b in _BOX_EDGES:
         if np.isfinite(pixels[[a, b]]).all():
@@ -287,24 +292,22 @@ def _foreign_crop(one: ForeignReport, photo: PosedPhoto, image: RgbImage, option
     return Crop(crop, photo.name, None)
 
 
-def _cut(image: RgbImage, photo: PosedPhoto, corners: Array, options: CropOptions) -> tuple[RgbImage, Camera]:
+def _cut(image: RgbImage, photo: PosedPhoto, corners: Array) -> tuple[RgbImage, Camera]:
     """The region of a photo around points (N,3), scaled to the size of a crop, and its camera."""
     pixels = photo.camera.project(apply(photo.cam_from_scan, corners))
     pixels = pixels[np.isfinite(pixels).all(axis=1)]
     camera = photo.camera
     middle = 0.5 * (pixels.min(axis=0) + pixels.max(axis=0))
-    aspect = options.width_px / options.height_px
-    extent = np.ptp(pixels, axis=0) / options.share
-    width = float(np.clip(max(extent[0], extent[1] * aspect, options.min_px), 1, camera.width))
+    aspect = WIDTH_PX / HEIGHT_PX
+    extent = np.ptp(pixels, axis=0) / SHARE
+    width = float(np.clip(max(extent[0], extent[1] * aspect, MIN_PX), 1, camera.width))
     width = min(width, camera.height * aspect)
     size = np.array([round(width), round(width / aspect)])
     low = np.clip(np.round(middle - 0.5 * size), 0, np.array([camera.width, camera.height]) - size).astype(int)
     part = image[low[1] : low[1] + size[1], low[0] : low[0] + size[0]]
-    shrinks = size[0] > options.width_px
-    crop = cv2.resize(
-        part, (options.width_px, options.height_px), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC
-    )
+    shrinks = size[0] > WIDTH_PX
+    crop = cv2.resize(part, (WIDTH_PX, HEIGHT_PX), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC)
     shifted = replace(
         camera, width=int(size[0]), height=int(size[1]), cx=camera.cx - float(low[0]), cy=camera.cy - float(low[1])
     )
-    return np.ascontiguousarray(crop, dtype=np.uint8), shifted.scaled(options.width_px, options.height_px)
+    return np.ascontiguousarray(crop, dtype=np.uint8), shifted.scaled(WIDTH_PX, HEIGHT_PX)

@@ -10,13 +10,19 @@ from typing import Any
 from markupsafe import Markup
 
 from arview.cad.part import Part
+from arview.quality.rework import drawing_svg, instructions
 from arview.report.evidence import ReportEvidence
-from arview.rework import drawing_svg, instructions
 
 _HOW = {
-    "install": "install", "adjust": "adjust", "unbolt": "unbolt and move", "reweld": "weld again",
-    "reglue": "glue again", "shim": "shim", "bend": "bend", "replace": "replace",
-}  # fmt: skip
+    "install": "install",
+    "adjust": "adjust",
+    "unbolt": "unbolt and move",
+    "reweld": "weld again",
+    "reglue": "glue again",
+    "shim": "shim",
+    "bend": "bend",
+    "replace": "replace",
+}
 MAX_SIDE_PX = 900
 """Longer side of the pictures that a report holds."""
 

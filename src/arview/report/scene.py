@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import json
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -28,21 +27,20 @@ _REACH_MM = 3.0
 """Points farther from the CAD model have no distance."""
 
 
-@dataclass(frozen=True)
-class SceneOptions:
-    """Size of the scene."""
-
-    max_points: int = (
-        90_000  # points of the cloud; about 1.3 MB in the page, dense enough for a part that fills the screen
-    )
-    max_faces: int = 400_000  # triangles above which the CAD model is omitted, because the page would become slow
-    margin: float = 0.15  # margin around the part, share of its diameter, outside of which the cloud is cut off
+MAX_POINTS = 90_000
+MAX_FACES = 400_000
+"""Triangles above which the CAD model is omitted, because the page would become slow."""
+MARGIN = 0.15
+"""Margin around the part, share of its diameter, outside of which the cloud is cut off."""
 
 
 def make_scene(
-    inspection: Inspection, model: Model | None, cloud: DenseCloud | None, distances: DistanceMap | None,
-    options: SceneOptions | None = None, sparse: SparseModel | None = None,
-) -> dict[str, Any] | None:  # fmt: skip
+    inspection: Inspection,
+    model: Model | None,
+    cloud: DenseCloud | None,
+    distances: DistanceMap | None,
+    sparse: SparseModel | None = None,
+) -> dict[str, Any] | None:
     """The scene as a JSON object; None when there is neither CAD model nor cloud. All data are in one frame.
 
     Surfaces of the CAD that no two photos saw are listed on their own, to be hatched: there the CAD model stands in
@@ -53,11 +51,9 @@ def make_scene(
         model: the CAD model, or None.
         cloud: cloud in the colours of the photos, or None.
         distances: distances of a cloud to the CAD model, used if there is no cloud with colours.
-        options: see `SceneOptions`.
         sparse: photos with their poses, or None.
     """
-    options = options or SceneOptions()
-    if model is not None and len(model.mesh[1]) > options.max_faces:
+    if model is not None and len(model.mesh[1]) > MAX_FACES:
         model = None
     scene: dict[str, Any] = {"stops": COLOR_STOPS.tolist(), "components": []}
     if model is not None:
@@ -65,7 +61,7 @@ def make_scene(
         if sparse is not None and sparse.photos:
             scene["uncovered"] = _uncovered(model, sparse)
         scene["arrow_scale"] = arrow_scale(inspection, model.diameter_mm, OverlayOptions())
-    points = _points(cloud, model, distances, options)
+    points = _points(cloud, model, distances)
     if points is not None:
         scene["cloud"] = points
     if model is None and points is None:
@@ -119,19 +115,17 @@ def _uncovered(model: Model, sparse: SparseModel) -> dict[str, Any]:
     return {**(_packed(corners) if len(corners) else {"points": ""}), "shares": shares}
 
 
-def _points(
-    cloud: DenseCloud | None, model: Model | None, distances: DistanceMap | None, options: SceneOptions
-) -> dict[str, Any] | None:
+def _points(cloud: DenseCloud | None, model: Model | None, distances: DistanceMap | None) -> dict[str, Any] | None:
     """A random sample of the points near the part, with colours and distances as far as they are known."""
     rng = np.random.default_rng(0)
     if cloud is not None:
         points = np.asarray(cloud.points, dtype=np.float64)
         keep = np.isfinite(points).all(axis=1)
         if model is not None:
-            reach = options.margin * model.diameter_mm
+            reach = MARGIN * model.diameter_mm
             low, high = model.bounds_in_model
             keep &= ((points > low - reach) & (points < high + reach)).all(axis=1)
-        chosen = _choice(np.flatnonzero(keep), options.max_points, rng)
+        chosen = _choice(np.flatnonzero(keep), MAX_POINTS, rng)
         if len(chosen) == 0:
             return None
         near: dict[str, Any] = {"colors": _text(np.asarray(cloud.colors[chosen], dtype="u1"))}
@@ -139,7 +133,7 @@ def _points(
             near["distances"] = _text(_distances_um(points[chosen], model))
         return {**_packed(points[chosen]), **near, "of": len(points)}
     if distances is not None:
-        chosen = _choice(np.arange(len(distances.distances)), options.max_points, rng)
+        chosen = _choice(np.arange(len(distances.distances)), MAX_POINTS, rng)
         um = np.round(1000.0 * distances.distances[chosen]).clip(-32767, 32767).astype("<i2")
         return {**_packed(distances.points_in_model[chosen]), "distances": _text(um), "of": len(distances.distances)}
     return None

@@ -102,9 +102,17 @@ def _read(path: Path) -> tuple[dict[str, Any], SavedViews]:
 
 
 _DAMAGES = (
-    ValueError, KeyError, TypeError, EOFError, OverflowError, RuntimeError, SyntaxError, zipfile.BadZipFile, zlib.error,
+    ValueError,
+    KeyError,
+    TypeError,
+    EOFError,
+    OverflowError,
+    RuntimeError,
+    SyntaxError,
+    zipfile.BadZipFile,
+    zlib.error,
     tokenize.TokenError,
-)  # fmt: skip
+)
 """What the readers of ZIP archives, of headers of arrays and of JSON raise for damaged files."""
 
 

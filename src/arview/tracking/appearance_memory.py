@@ -6,63 +6,47 @@ are searched for by correlation, see `ncc_search`; the results are rough poses f
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from arview.camera import Camera
-from arview.errors import InputError
 from arview.geometry import Array, rolls_between
 from arview.guideviews import GuideViewSet
 from arview.tracking.appearance_file import SavedViews, load_views, save_views
 from arview.tracking.estimate import Estimate
 from arview.tracking.search.ncc_search import (
     NEIGHBOUR_STEPS,
+    ROLL_STEPS,
     AppearanceMatch,
     NccSearch,
-    NccSearchOptions,
     StoredViews,
     pattern_search,
 )
 from arview.tracking.search.view_crops import CHANNELS, CROP_PX, ViewCrop, ViewCropper
 from arview.tracking.search.window_search import WINDOW_PX, rolled_templates
 
-
-@dataclass(frozen=True)
-class AppearanceMemoryOptions:
-    """Options of the memory.
-
-    Attributes:
-        max_views: views kept at most; each takes 4 kB in a file and 80 kB in memory.
-        view_step_deg: a direction that differs by more from all kept ones is a new view.
-        learn_every: frames between two checks whether the direction of view is new.
-        compare_every: frames between two checks whether the part looks different from the kept views.
-        same_score: correlation with the nearest kept view below which the part looks different.
-        min_quality: quality of the pose needed to learn from a frame.
-        min_in_picture: share of the outline in the picture needed to learn from a frame.
-        min_support: share of the usual support of the outline needed, because a hand over the part lowers it.
-        support_decay: factor by which the usual support decreases in each frame.
-        steady_frames: frames in a row that must fulfil these conditions.
-        search: options of the search.
-    """
-
-    max_views: int = 48
-    view_step_deg: float = 8.0
-    learn_every: int = 4
-    compare_every: int = 16
-    same_score: float = 0.75
-    min_quality: float = 0.8
-    min_in_picture: float = 0.75
-    min_support: float = 0.85
-    support_decay: float = 0.99
-    steady_frames: int = 5
-    search: NccSearchOptions = field(default_factory=NccSearchOptions)
-
-    def __post_init__(self) -> None:
-        if self.max_views < 1:
-            raise InputError(f"appearance memory: max_views = {self.max_views}, expected at least 1")
+MAX_VIEWS = 48
+"""Views kept at most; each takes 4 kB in a file and 80 kB in memory."""
+VIEW_STEP_DEG = 8.0
+"""A direction that differs by more from all kept ones is a new view."""
+LEARN_EVERY = 4
+"""Frames between two checks whether the direction of view is new."""
+COMPARE_EVERY = 16
+"""Frames between two checks whether the part looks different from the kept views."""
+SAME_SCORE = 0.75
+"""Correlation with the nearest kept view below which the part looks different."""
+MIN_QUALITY = 0.8
+"""Quality of the pose needed to learn from a frame."""
+MIN_IN_PICTURE = 0.75
+"""Share of the outline in the picture needed to learn from a frame."""
+MIN_SUPPORT = 0.85
+"""Share of the usual support of the outline needed, because a hand over the part lowers it."""
+SUPPORT_DECAY = 0.99
+"""Factor by which the usual support decreases in each frame."""
+STEADY_FRAMES = 5
+"""Frames in a row that must fulfil these conditions."""
 
 
 class AppearanceMemory:
@@ -71,15 +55,13 @@ class AppearanceMemory:
     Args:
         views: guide views of the part, from which its silhouettes are drawn.
         camera: intrinsics of the frames; saved views can be used with any camera.
-        options: see `AppearanceMemoryOptions`.
     """
 
-    def __init__(self, views: GuideViewSet, camera: Camera, options: AppearanceMemoryOptions | None = None) -> None:
-        self.options = o = options or AppearanceMemoryOptions()
+    def __init__(self, views: GuideViewSet, camera: Camera) -> None:
         self.views = views
         self._cropper = ViewCropper(views, camera)
-        self._search = NccSearch(self._cropper, o.search)
-        count, rolls = o.max_views, o.search.roll_steps
+        self._search = NccSearch(self._cropper)
+        count, rolls = MAX_VIEWS, ROLL_STEPS
         self._count = 0
         self._stored = StoredViews(
             rotations=np.zeros((count, 3, 3)),
@@ -111,19 +93,18 @@ class AppearanceMemory:
             estimate: estimate of the tracker in this frame.
             is_sure: whether the part is tracked and nothing contradicts its pose.
         """
-        o = self.options
         evidence = estimate.evidence
         self._frame += 1
-        self._usual_support = max(o.support_decay * self._usual_support, evidence.contour_support)
-        is_clear = evidence.contour_support >= o.min_support * self._usual_support
-        is_good = estimate.quality >= o.min_quality and evidence.points_in_picture >= o.min_in_picture
+        self._usual_support = max(SUPPORT_DECAY * self._usual_support, evidence.contour_support)
+        is_clear = evidence.contour_support >= MIN_SUPPORT * self._usual_support
+        is_good = estimate.quality >= MIN_QUALITY and evidence.points_in_picture >= MIN_IN_PICTURE
         self._steady_frames = self._steady_frames + 1 if is_sure and is_clear and is_good else 0
-        if self._steady_frames < o.steady_frames or self._frame % o.learn_every:
+        if self._steady_frames < STEADY_FRAMES or self._frame % LEARN_EVERY:
             return False
         cam_from_model = estimate.cam_from_model
         cosines = self.rotations[:, 2] @ self._cropper.axis_pose(cam_from_model).rotation[2]
-        is_new = self._count == 0 or cosines.max() < np.cos(np.deg2rad(o.view_step_deg))
-        if not is_new and self._frame - self._compared_at < o.compare_every:
+        is_new = self._count == 0 or cosines.max() < np.cos(np.deg2rad(VIEW_STEP_DEG))
+        if not is_new and self._frame - self._compared_at < COMPARE_EVERY:
             return False
         self._compared_at = self._frame
         return self.add(image, cam_from_model, is_new)
@@ -146,22 +127,22 @@ class AppearanceMemory:
     def _looks_known(self, crop: ViewCrop, rotation: Array) -> bool:
         """Whether a kept view from about the direction of a rotation (3,3) correlates with a crop."""
         cosines = self.rotations[:, 2] @ rotation[2]
-        near = np.flatnonzero(cosines > np.cos(np.deg2rad(self.options.view_step_deg)))
+        near = np.flatnonzero(cosines > np.cos(np.deg2rad(VIEW_STEP_DEG)))
         middle = 0.5 * (CROP_PX - 1)
         picture = crop.picture.astype(np.float32)
         for k in near:
             start = np.array([middle, middle, rolls_between(self._stored.rotations[k], rotation), 1.0])
             score, _ = pattern_search(
                 picture, self._stored.pictures[k], self._stored.masks[k], start, NEIGHBOUR_STEPS, 1
-            )  # fmt: skip
-            if score >= self.options.same_score:
+            )
+            if score >= SAME_SCORE:
                 return True
         return False
 
     def _store(self, rotation: Array, picture: NDArray[np.uint8], mask: NDArray[np.uint8]) -> None:
         """Keep a view; beyond the limit it replaces the older of the two views nearest in direction."""
         place = self._count
-        if place == self.options.max_views:
+        if place == MAX_VIEWS:
             directions = self.rotations[:, 2]
             nearness = directions @ directions.T
             np.fill_diagonal(nearness, -1.0)
@@ -174,7 +155,7 @@ class AppearanceMemory:
         stored.pictures[place] = picture
         stored.masks[place] = mask
         self._added_at[place] = self._added = self._added + 1
-        templates = rolled_templates(picture, mask, self.options.search.roll_steps)
+        templates = rolled_templates(picture, mask, ROLL_STEPS)
         stored.templates[place], stored.weights[place] = templates
 
     # --- Search -----------------------------------------------------------------------------------------------

@@ -8,7 +8,7 @@ where the search for the whole part fails; a pose found by it says nothing of th
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -24,39 +24,27 @@ from arview.guideviews import GuideViewOptions, GuideViewSet
 from arview.guideviews.cache import cached_guide_views
 from arview.refinement.view_model import PartView
 
-
-@dataclass(frozen=True)
-class BaseDetectionOptions:
-    """Options of the detection by the base.
-
-    Attributes:
-        min_width: smaller side of the base's outline, in diameters of the base, below which a pose is not accepted: a
-            plate seen edge-on fits every strip.
-        recheck_frames: while no component but the base is seen, it is searched for again after so many frames, because
-            it may have been mistaken; no component is called missing before it is found there once more.
-        restless_frames: the same where the pose jumps while components are absent.
-        whole_frames: while a pose rests on the base alone, the whole part is searched for again after so many frames,
-            because another thing may have been mistaken for the base.
-        same_share, same_deg: distance in diameters and rotation within which two poses are the same.
-        alternative_share, alternative_deg: distance in diameters and rotation from which another pose that was found is
-            an alternative.
-        min_quality: probability below which a pose of the base is not accepted: bases are plainer than whole parts.
-        full_every: every so many-th of the full searches of the whole part that fail is followed by one of the base.
-        views: options of the base's guide views; they are fewer than those of the part, because they are made while a
-            session runs.
-    """
-
-    min_quality: float = 0.9
-    min_width: float = 0.25
-    recheck_frames: int = 15
-    restless_frames: int = 8
-    whole_frames: int = 15
-    same_share: float = 0.1
-    same_deg: float = 12.0
-    alternative_share: float = 0.25
-    alternative_deg: float = 8.0
-    full_every: int = 2
-    views: GuideViewOptions = field(default_factory=lambda: GuideViewOptions(subdivisions=3))
+MIN_QUALITY = 0.9
+"""Probability below which a pose of the base is not accepted: bases are plainer than whole parts."""
+MIN_WIDTH = 0.25
+"""Smaller side of the base's outline, in diameters of the base, below which a pose is not accepted: a plate seen
+edge-on fits every strip."""
+RECHECK_FRAMES = 15
+"""While no component but the base is seen, it is searched for again after so many frames, because it may have been
+mistaken; no component is called missing before it is found there once more."""
+RESTLESS_FRAMES = 8
+"""The same where the pose jumps while components are absent."""
+WHOLE_FRAMES = 15
+"""While a pose rests on the base alone, the whole part is searched for again after so many frames, because another
+thing may have been mistaken for the base."""
+SAME_SHARE = 0.1
+SAME_DEG = 12.0
+"""Distance in diameters and rotation within which two poses are the same."""
+FULL_EVERY = 2
+"""Every so many-th of the full searches of the whole part that fail is followed by one of the base."""
+VIEWS: GuideViewOptions = GuideViewOptions(subdivisions=3)
+"""Options of the base's guide views; they are fewer than those of the part, because they are made while a session
+runs."""
 
 
 class BaseDetection:
@@ -67,7 +55,6 @@ class BaseDetection:
         camera: of the pictures.
         model: of the guide views.
         detector: options of the detector; None chooses them by the declared range.
-        options: see `BaseDetectionOptions`.
     """
 
     def __init__(
@@ -76,9 +63,7 @@ class BaseDetection:
         camera: Camera,
         model: Model,
         detector: DetectorOptions | None = None,
-        options: BaseDetectionOptions | None = None,
     ) -> None:
-        self.options = options or BaseDetectionOptions()
         self._views, self._camera, self._model = views, camera, model
         self._detector_options = detector
         self._detector: Detector | None = None
@@ -100,13 +85,13 @@ class BaseDetection:
         if not self.is_possible:
             return []
         if searches is None:
-            is_due = self._full_searches % self.options.full_every == 0
+            is_due = self._full_searches % FULL_EVERY == 0
             self._full_searches += 1
             if not is_due:
                 return []
         self._frames_since = 0
         found = self.detector.detect(image, searches=searches)
-        is_accepted = [one.quality >= self.options.min_quality and self._is_wide(one.cam_from_model) for one in found]
+        is_accepted = [one.quality >= MIN_QUALITY and self._is_wide(one.cam_from_model) for one in found]
         return [one for one, is_good in zip(found, is_accepted, strict=True) if is_good][:1]
 
     def is_recheck_due(self, is_bare: bool, is_restless: bool) -> bool:
@@ -119,7 +104,7 @@ class BaseDetection:
             is_restless: the pose jumps.
         """
         self._frames_since += 1
-        wait = self.options.restless_frames if is_restless else self.options.recheck_frames
+        wait = RESTLESS_FRAMES if is_restless else RECHECK_FRAMES
         return (is_bare or is_restless) and self._frames_since >= wait
 
     def find_whole(
@@ -142,7 +127,7 @@ class BaseDetection:
             min_quality: of the detection.
         """
         self._frames_since_whole += 1
-        if self._frames_since_whole < self.options.whole_frames:
+        if self._frames_since_whole < WHOLE_FRAMES:
             return None
         self._frames_since_whole = 0
         self._whole_searches += 1
@@ -156,8 +141,7 @@ class BaseDetection:
 
     def is_same(self, components: AssemblyMonitor, a: Array, b: Array) -> bool:
         """Whether two poses (4,4) are the same, or would be if the base had no other components."""
-        o = self.options
-        return components.is_same_but_turned(a, b, o.same_share * self._views.diameter_mm, o.same_deg)
+        return components.is_same_but_turned(a, b, SAME_SHARE * self._views.diameter_mm, SAME_DEG)
 
     def _is_wide(self, cam_from_model: Array) -> bool:
         """Whether enough of the base is seen at a pose (4,4) for it not to fit every strip."""
@@ -167,7 +151,7 @@ class BaseDetection:
             return True
         flat = (in_cam[:, :2] / in_cam[:, 2:]).astype(np.float32)
         width = min(cv2.minAreaRect(flat)[1]) * float(in_cam[:, 2].mean())
-        return bool(width >= self.options.min_width * np.linalg.norm(np.ptp(base.bounds_in_model, axis=0)))
+        return bool(width >= MIN_WIDTH * np.linalg.norm(np.ptp(base.bounds_in_model, axis=0)))
 
     @property
     def detector(self) -> Detector:
@@ -175,10 +159,10 @@ class BaseDetection:
         if self._detector is None:
             base = self._model.components[base_of(self._model)]
             model = make_model(f"{self._model.name} {base.name}", (base,))
-            views = cached_guide_views(model, self._views.view_range, self.options.views)
+            views = cached_guide_views(model, self._views.view_range, VIEWS)
             options = self._detector_options or options_for(views)
             # A search that ends early must not end with a pose that is not accepted.
-            options = replace(options, min_quick_quality=max(options.min_quick_quality, self.options.min_quality))
+            options = replace(options, min_quick_quality=max(options.min_quick_quality, MIN_QUALITY))
             local = local_search_for(views, self._camera, options)
             self._detector = Detector(views, self._camera, options, local=local)
             self._part = _about(local.refiner.part, self._views.center_in_model)

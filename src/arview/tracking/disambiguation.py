@@ -2,22 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from arview.geometry import Array
 
-
-@dataclass(frozen=True)
-class HypothesisSetOptions:
-    """Options of the disambiguation.
-
-    Attributes:
-        decision_margin: sum over the frames of the differences in score that decides between two poses.
-    """
-
-    decision_margin: float = 0.25
+DECISION_MARGIN = 0.25
+"""Sum over the frames of the differences in score that decides between two poses."""
 
 
 class HypothesisSet:
@@ -25,11 +15,9 @@ class HypothesisSet:
 
     Args:
         model_from_other: (4,4) transforms on the model's side that lead from the tracked pose to each alternative.
-        options: see `HypothesisSetOptions`.
     """
 
-    def __init__(self, model_from_other: list[Array], options: HypothesisSetOptions | None = None) -> None:
-        self.options = options or HypothesisSetOptions()
+    def __init__(self, model_from_other: list[Array]) -> None:
         self.model_from_other = model_from_other
         self._margins = [0.0] * len(model_from_other)
 
@@ -55,9 +43,9 @@ class HypothesisSet:
         pairs = zip(self._margins, other_scores, strict=True)
         self._margins = [margin + score - other for margin, other in pairs]
         worst = int(np.argmin(self._margins))
-        if self._margins[worst] <= -self.options.decision_margin:
+        if self._margins[worst] <= -DECISION_MARGIN:
             return self.model_from_other[worst]
-        kept = [k for k, margin in enumerate(self._margins) if margin < self.options.decision_margin]
+        kept = [k for k, margin in enumerate(self._margins) if margin < DECISION_MARGIN]
         self.model_from_other = [self.model_from_other[k] for k in kept]
         self._margins = [self._margins[k] for k in kept]
         return None

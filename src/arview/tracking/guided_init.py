@@ -7,7 +7,7 @@ are refined and scored by the same evidence as a tracked pose.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -27,47 +27,37 @@ from arview.refinement.schedules import LAST_STAGES, SEARCH_STAGES
 from arview.refinement.view_model import PartView
 from arview.refinement.working_picture import WorkingScaleOptions
 
-
-@dataclass(frozen=True)
-class GuidedInitOptions:
-    """Options of the guided initialisation.
-
-    The limits are wider than the search (15°, 15 % and 15 %), because the best pose at its border may be just outside.
-
-    Attributes:
-        turn_limit_deg: largest rotation between the given pose and an accepted one.
-        distance_limit: largest relative difference of their distances.
-        offset_limit: largest shift between them across the line of sight, in diameters of the part.
-        min_in_picture: share of the outline inside the picture needed to accept a pose.
-        min_coarse: edge score of the first round below which the part is not there.
-        min_fine: edge score of the second round below which the part is not there.
-        min_score: score of a pose, reduced for a plain view, needed to accept it.
-        plain_penalty: reduction of the score for a view without distinct lines.
-        rival_score_share: share of the score with which a nearer pose of the same outline makes a pose ambiguous.
-        rival_distance: ratio of the distances around which a nearer pose is searched for.
-        max_rival_distance: a nearer pose at a larger ratio is the same pose.
-        crop_reach: half size of the crop, in half diameters, because the part may be nearer than the given pose.
-        max_scored: best poses of a grid that are compared with each other.
-        contour_points, design_points: points of outline and of design edges that are scored.
-        scale: options of the picture in which the best poses are refined and scored.
-    """
-
-    turn_limit_deg: float = 20.0
-    distance_limit: float = 0.2
-    offset_limit: float = 0.2
-    min_in_picture: float = 0.4
-    rival_score_share: float = 0.8
-    min_coarse: float = 0.34
-    min_fine: float = 0.4
-    min_score: float = 0.6
-    plain_penalty: float = 0.3
-    rival_distance: float = 0.55
-    max_rival_distance: float = 0.85
-    crop_reach: float = 1.35
-    max_scored: int = 400
-    contour_points: int = 64
-    design_points: int = 32
-    scale: WorkingScaleOptions = field(default_factory=WorkingScaleOptions)
+TURN_LIMIT_DEG = 20.0
+"""Largest rotation between the given pose and an accepted one."""
+DISTANCE_LIMIT = 0.2
+"""Largest relative difference of their distances."""
+OFFSET_LIMIT = 0.2
+"""Largest shift between them across the line of sight, in diameters of the part."""
+MIN_IN_PICTURE = 0.4
+"""Share of the outline inside the picture needed to accept a pose."""
+RIVAL_SCORE_SHARE = 0.8
+"""Share of the score with which a nearer pose of the same outline makes a pose ambiguous."""
+MIN_COARSE = 0.34
+"""Edge score of the first round below which the part is not there."""
+MIN_FINE = 0.4
+"""Edge score of the second round below which the part is not there."""
+MIN_SCORE = 0.6
+"""Score of a pose, reduced for a plain view, needed to accept it."""
+PLAIN_PENALTY = 0.3
+"""Reduction of the score for a view without distinct lines."""
+RIVAL_DISTANCE = 0.55
+"""Ratio of the distances around which a nearer pose is searched for."""
+MAX_RIVAL_DISTANCE = 0.85
+"""A nearer pose at a larger ratio is the same pose."""
+CROP_REACH = 1.35
+"""Half size of the crop, in half diameters, because the part may be nearer than the given pose."""
+MAX_SCORED = 400
+"""Best poses of a grid that are compared with each other."""
+CONTOUR_POINTS = 64
+DESIGN_POINTS = 32
+"""Points of outline and of design edges that are scored."""
+SCALE = WorkingScaleOptions()
+"""Options of the picture in which the best poses are refined and scored."""
 
 
 @dataclass(frozen=True)
@@ -153,11 +143,9 @@ class GuidedInit:
     Args:
         views: guide views of the part.
         camera: intrinsics of the frames.
-        options: see `GuidedInitOptions`.
     """
 
-    def __init__(self, views: GuideViewSet, camera: Camera, options: GuidedInitOptions | None = None) -> None:
-        self.options = options or GuidedInitOptions()
+    def __init__(self, views: GuideViewSet, camera: Camera) -> None:
         self.camera = camera
         self._views = views
         self._center_in_model = views.center_in_model
@@ -182,7 +170,7 @@ class GuidedInit:
     def lock(self, image: NDArray[np.uint8], cam_from_model: Array, min_quality: float) -> GuidedPose | None:
         """The pose of the part if it is certainly near the given one, else None.
 
-        A pose must be good enough, near enough (see `GuidedInitOptions`), and its score must be the higher the plainer
+        A pose must be good enough, near enough, and its score must be the higher the plainer
         the view is. Nor may a plain part be a figure on itself: print on a box can look like a smaller box, and then a
         nearer pose around it fits as well. Most pictures without the part are rejected after the first round.
 
@@ -192,41 +180,40 @@ class GuidedInit:
             min_quality: quality needed.
         """
         start = cam_from_model @ self._refiner.part.model_from_body
-        near = self._search(image, start, [start], COARSE, self.options.min_coarse)
-        found = self._best(image, self._search(image, start, near, FINE, self.options.min_fine))
+        near = self._search(image, start, [start], COARSE, MIN_COARSE)
+        found = self._best(image, self._search(image, start, near, FINE, MIN_FINE))
         if found is None or found.quality < min_quality or not self.is_near(found.cam_from_model, cam_from_model):
             return None
         lines = view_lines(self._views.nearest(found.cam_from_model), self._views.diameter_mm)
         plainness = max(1.0 - lines / (2.0 * PLAIN_LINES), 0.0)
-        if found.evidence.score - self.options.plain_penalty * plainness < self.options.min_score:
+        if found.evidence.score - PLAIN_PENALTY * plainness < MIN_SCORE:
             return None
         return None if lines < PLAIN_LINES and self._has_rival(image, found) else found
 
     def is_near(self, cam_from_model: Array, guide_cam_from_model: Array) -> bool:
-        """Whether a pose (4,4) is within the limits of `GuidedInitOptions` around a given one (4,4)."""
-        o = self.options
+        """Whether a pose (4,4) is within the limits around a given one (4,4)."""
         center = apply(cam_from_model, self._center_in_model)
         wanted = apply(guide_cam_from_model, self._center_in_model)
         if center[2] <= 0:
             return False
         aside_mm = np.linalg.norm(center[:2] / center[2] - wanted[:2] / wanted[2]) * wanted[2]
         return bool(
-            np.rad2deg(rotation_angle_rad(cam_from_model, guide_cam_from_model)) <= o.turn_limit_deg
-            and abs(np.linalg.norm(center) / np.linalg.norm(wanted) - 1.0) <= o.distance_limit
-            and aside_mm <= o.offset_limit * self._refiner.diameter_mm
+            np.rad2deg(rotation_angle_rad(cam_from_model, guide_cam_from_model)) <= TURN_LIMIT_DEG
+            and abs(np.linalg.norm(center) / np.linalg.norm(wanted) - 1.0) <= DISTANCE_LIMIT
+            and aside_mm <= OFFSET_LIMIT * self._refiner.diameter_mm
         )
 
     def _has_rival(self, image: NDArray[np.uint8], found: GuidedPose) -> bool:
         """Whether a much nearer pose of the same outline fits about as well."""
         pose = found.cam_from_model @ self._refiner.part.model_from_body
         nearer = pose.copy()
-        nearer[:3, 3] *= self.options.rival_distance
+        nearer[:3, 3] *= RIVAL_DISTANCE
         starts = self._search(image, nearer, self._search(image, nearer, [nearer], RIVAL), FINE)
         rival = self._best(image, starts)
-        if rival is None or rival.evidence.score < self.options.rival_score_share * found.evidence.score:
+        if rival is None or rival.evidence.score < RIVAL_SCORE_SHARE * found.evidence.score:
             return False
         center = apply(rival.cam_from_model, self._center_in_model)
-        return bool(np.linalg.norm(center) < self.options.max_rival_distance * np.linalg.norm(pose[:3, 3]))
+        return bool(np.linalg.norm(center) < MAX_RIVAL_DISTANCE * np.linalg.norm(pose[:3, 3]))
 
     def _search(
         self, image: NDArray[np.uint8], around: Array, starts: list[Array], level: SearchLevel, min_score: float = 0.0
@@ -242,18 +229,26 @@ class GuidedInit:
         """
         if not starts or around[2, 3] <= 0:
             return []
-        o = self.options
         maps = self._maps(image, around, level)
         if maps is None:
             return []
 
         def search(start: Array) -> list[tuple[float, Array]]:
             scores, poses = score_around(
-                maps[0], self._refiner.part.arrays, start, maps[1], 0.01 * self._refiner.diameter_mm,
-                level.turns, level.stretches, level.shift_px, level.shift_step_px, o.contour_points, o.design_points,
-            )  # fmt: skip
+                maps[0],
+                self._refiner.part.arrays,
+                start,
+                maps[1],
+                0.01 * self._refiner.diameter_mm,
+                level.turns,
+                level.stretches,
+                level.shift_px,
+                level.shift_step_px,
+                CONTOUR_POINTS,
+                DESIGN_POINTS,
+            )
             best: list[tuple[float, Array]] = []
-            for index in np.argsort(-scores)[: o.max_scored]:
+            for index in np.argsort(-scores)[:MAX_SCORED]:
                 if not any(self._is_same(poses[index], other, level.separation_deg) for _, other in best):
                     best.append((float(scores[index]), poses[index]))
                     if len(best) >= level.kept_each:
@@ -276,7 +271,7 @@ class GuidedInit:
         camera = self.camera
         radius_px = self._refiner.radius_px(cam_from_body)
         scale = min(1.0, level.radius_px / radius_px)
-        reach_px = self.options.crop_reach * radius_px + level.shift_px / scale
+        reach_px = CROP_REACH * radius_px + level.shift_px / scale
         center = camera.project(cam_from_body[:3, 3])
         size = np.array([camera.width, camera.height])
         first = np.clip(np.floor(center - reach_px), 0, size).astype(int)
@@ -309,7 +304,7 @@ class GuidedInit:
             pose, _ = levels.refine(pose, LAST_STAGES, appearance, first=-1 if is_near else 0)
             scores = levels.scores(pose, appearance)
             evidence = scores.evidence
-            is_inside = evidence.points_in_picture >= self.options.min_in_picture
+            is_inside = evidence.points_in_picture >= MIN_IN_PICTURE
             found = pose @ self._refiner.part.body_from_model
             return scores.mean, GuidedPose(found, evidence, evidence.quality if is_inside else 0.0)
 
@@ -318,9 +313,9 @@ class GuidedInit:
 
     def _levels(self, image: NDArray[np.uint8], starts: list[Array]) -> RefinementPyramid:
         """The picture at the scales of a part at some poses (4,4), the first of which tells how sharp its edges are."""
-        levels = RefinementPyramid(self._refiner, image, starts, options=self.options.scale)
+        levels = RefinementPyramid(self._refiner, image, starts, options=SCALE)
         spread_px = levels.finest.edge_spread_px(starts[0])
-        return RefinementPyramid(self._refiner, image, starts, spread_px or 0.0, self.options.scale)
+        return RefinementPyramid(self._refiner, image, starts, spread_px or 0.0, SCALE)
 
     def _is_same(self, a: Array, b: Array, angle_deg: float) -> bool:
         """Whether two poses (4,4) differ by less than an angle, and by as many per cent of the diameter."""

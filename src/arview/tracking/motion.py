@@ -9,8 +9,6 @@ count as usual. Whether an innovation is unusual is then a chi-squared test of i
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from arview.geometry import Array, log_so3, rotation_angle_rad
@@ -64,66 +62,54 @@ def _units(diameter_mm: float) -> Array:
     return np.concatenate([np.full(3, ROTATION_UNIT_RAD), shifts])
 
 
-@dataclass(frozen=True)
-class MotionOptions:
-    """Options of the learned motion; lengths are in the units of `innovation`, 0.03 is 1.3° or 1 % of the diameter.
-
-    Attributes:
-        prior_sigma: standard deviation of each component before anything is learned: a steady hand.
-        min_sigma: standard deviation of the measured poses themselves, which is added.
-        rate: share by which the covariance follows each frame.
-        max_squared: squared Mahalanobis distance from which an innovation weighs less; one in eight normally
-            distributed ones exceeds it.
-        robust_gain: factor that makes up for this in the mean of normally distributed innovations.
-        min_unusual: squared Mahalanobis distance of an unusual innovation; one in seventy normally distributed ones
-            exceeds it, more where motion has heavy tails.
-        min_unusual_motion: smallest squared length of an unusual innovation, about 3°.
-        max_usual_motion: largest squared length of a usual one, about 14°: the refinement reaches no farther.
-        unrest_decay: factor by which the number of recent unusual innovations decreases in each frame.
-        max_unrest: number of recent unusual innovations from which the pose is not to be trusted: two within four
-            frames. A hand starts or stops; a wrong pose jumps again and again.
-        max_calm_unrest: number up to which motion is calm: none within three frames.
-    """
-
-    prior_sigma: float = 0.03
-    min_sigma: float = 0.012
-    rate: float = 0.05
-    max_squared: float = 10.0
-    robust_gain: float = 1.06
-    min_unusual: float = 16.0
-    min_unusual_motion: float = 0.005
-    max_usual_motion: float = 0.1
-    unrest_decay: float = 0.75
-    max_unrest: float = 1.4
-    max_calm_unrest: float = 0.5
+PRIOR_SIGMA = 0.03
+"""Standard deviation of each component before anything is learned: a steady hand."""
+MIN_SIGMA = 0.012
+"""Standard deviation of the measured poses themselves, which is added."""
+RATE = 0.05
+"""Share by which the covariance follows each frame."""
+MAX_SQUARED = 10.0
+"""Squared Mahalanobis distance from which an innovation weighs less; one in eight normally distributed ones exceeds
+it."""
+ROBUST_GAIN = 1.06
+"""Factor that makes up for this in the mean of normally distributed innovations."""
+MIN_UNUSUAL = 16.0
+"""Squared Mahalanobis distance of an unusual innovation; one in seventy normally distributed ones exceeds it, more
+where motion has heavy tails."""
+MIN_UNUSUAL_MOTION = 0.005
+"""Smallest squared length of an unusual innovation, about 3°."""
+MAX_USUAL_MOTION = 0.1
+"""Largest squared length of a usual one, about 14°: the refinement reaches no farther."""
+UNREST_DECAY = 0.75
+"""Factor by which the number of recent unusual innovations decreases in each frame."""
+MAX_UNREST = 1.4
+"""Number of recent unusual innovations from which the pose is not to be trusted: two within four frames. A hand starts
+or stops; a wrong pose jumps again and again."""
+MAX_CALM_UNREST = 0.5
+"""Number up to which motion is calm: none within three frames."""
 
 
 class MotionModel:
-    """The usual innovations of one part in one stream.
+    """The usual innovations of one part in one stream."""
 
-    Args:
-        options: see `MotionOptions`.
-    """
-
-    def __init__(self, options: MotionOptions | None = None) -> None:
-        self.options = options or MotionOptions()
-        self._covariance = self.options.prior_sigma**2 * np.eye(6)
+    def __init__(self) -> None:
+        self._covariance = PRIOR_SIGMA**2 * np.eye(6)
         self._unrest = 0.0
 
     @property
     def covariance(self) -> Array:
         """Covariance (6,6) of the usual innovations, with the noise of the measured poses."""
-        return self._covariance + self.options.min_sigma**2 * np.eye(6)
+        return self._covariance + MIN_SIGMA**2 * np.eye(6)
 
     @property
     def is_calm(self) -> bool:
         """Whether none of the last innovations was unusual."""
-        return self._unrest < self.options.max_calm_unrest
+        return self._unrest < MAX_CALM_UNREST
 
     @property
     def is_restless(self) -> bool:
         """Whether several of the last innovations were unusual, as those of a wrong pose are."""
-        return self._unrest > self.options.max_unrest
+        return self._unrest > MAX_UNREST
 
     def squared_distance(self, difference: Array, pose_covariance: Array | None = None) -> float:
         """Squared Mahalanobis distance of an innovation (6,).
@@ -137,13 +123,12 @@ class MotionModel:
 
     def is_unusual(self, difference: Array, pose_covariance: Array) -> bool:
         """Whether an innovation (6,) is neither usual in this stream nor explained by the covariance of the pose."""
-        o = self.options
         squared_length = difference @ difference
-        if squared_length > o.max_usual_motion:
+        if squared_length > MAX_USUAL_MOTION:
             return True
-        if squared_length <= o.min_unusual_motion or self.squared_distance(difference) <= o.min_unusual:
+        if squared_length <= MIN_UNUSUAL_MOTION or self.squared_distance(difference) <= MIN_UNUSUAL:
             return False
-        return self.squared_distance(difference, pose_covariance) > o.min_unusual
+        return self.squared_distance(difference, pose_covariance) > MIN_UNUSUAL
 
     def learn(self, difference: Array, pose_covariance: Array, is_confirmed: bool = False) -> None:
         """Take the innovation of a frame in; one confirmed by other means counts in full, however unusual.
@@ -153,9 +138,8 @@ class MotionModel:
             pose_covariance: (6,6) of `normalised_covariance`, of the pose.
             is_confirmed: whether the pose was confirmed or found by a recheck.
         """
-        o = self.options
-        self._unrest = o.unrest_decay * self._unrest + self.is_unusual(difference, pose_covariance)
+        self._unrest = UNREST_DECAY * self._unrest + self.is_unusual(difference, pose_covariance)
         weight = 1.0
         if not is_confirmed:
-            weight = o.robust_gain * min(1.0, o.max_squared / max(self.squared_distance(difference), 1e-9))
-        self._covariance += o.rate * (weight * np.outer(difference, difference) - self._covariance)
+            weight = ROBUST_GAIN * min(1.0, MAX_SQUARED / max(self.squared_distance(difference), 1e-9))
+        self._covariance += RATE * (weight * np.outer(difference, difference) - self._covariance)

@@ -10,7 +10,6 @@ size the networks need, with a prior around the predicted pose. It ends early wh
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import cv2
@@ -21,7 +20,13 @@ from arview.camera import Camera
 from arview.detection.features.image_pyramid import ImagePyramid
 from arview.detection.search.global_search import PoseCandidate
 from arview.detection.search.hypothesis import Hypothesis
-from arview.detection.search.local_search import LocalSearch, LocalSearchOptions
+from arview.detection.search.local_search import (
+    DISTINCT_DEG,
+    FINE_SCHEDULES,
+    FINE_TOLERANCE_PX,
+    LocalSearch,
+    LocalSearchOptions,
+)
 from arview.geometry import Array, are_near
 from arview.refinement.modalities.edge import smoothed
 from arview.refinement.schedules import SEARCH_STAGES, Stage
@@ -31,39 +36,27 @@ WINDOW_STEP_PX = 32
 """The sides of the window are multiples of this, so that networks see few different sizes."""
 
 
-@dataclass(frozen=True)
-class RecheckOptions:
-    """Options of the recheck.
-
-    Attributes:
-        search: options of the local search, with one level of the pattern search and fewer hypotheses than for a whole
-            picture.
-        kept: hypotheses kept after each level of the search.
-        radius_px: half diameter of the part to which the window is reduced.
-        reach: half size of the window, in half diameters of the part.
-        margin_px: pixels added to it, after the reduction.
-        min_in_picture: share of the outline inside the window below which hypotheses are dropped.
-        same_deg: hypotheses closer to the tracked pose are the tracked pose; hundredths of it are diameters.
-        motion_penalty: log odds that a squared motion distance of 1 costs: a Gaussian prior with a standard deviation
-            of 8°, or 6 % of the diameter sideways.
-        min_gain: log odds by which another pose must be likelier than the tracked one.
-        final_stages: schedule at full resolution of a pose found in a reduced window.
-    """
-
-    search: LocalSearchOptions = field(
-        default_factory=lambda: LocalSearchOptions(
-            levels=LocalSearchOptions().levels[:1], max_verified=3, use_shading=False
-        )
-    )
-    kept: tuple[int, ...] = (4,)
-    radius_px: float = 90.0
-    reach: float = 1.25
-    margin_px: float = 12.0
-    min_in_picture: float = 0.4
-    same_deg: float = 2.0
-    motion_penalty: float = 16.0
-    min_gain: float = 1.0
-    final_stages: tuple[Stage, ...] = SEARCH_STAGES[-2:]
+SEARCH = LocalSearchOptions(levels=LocalSearchOptions().levels[:1], max_verified=3, use_shading=False)
+"""Options of the local search, with one level of the pattern search and fewer hypotheses than for a whole picture."""
+KEPT: tuple[int, ...] = (4,)
+"""Hypotheses kept after each level of the search."""
+RADIUS_PX = 90.0
+"""Half diameter of the part to which the window is reduced."""
+REACH = 1.25
+"""Half size of the window, in half diameters of the part."""
+MARGIN_PX = 12.0
+"""Pixels added to it, after the reduction."""
+MIN_IN_PICTURE = 0.4
+"""Share of the outline inside the window below which hypotheses are dropped."""
+SAME_DEG = 2.0
+"""Hypotheses closer to the tracked pose are the tracked pose; hundredths of it are diameters."""
+MOTION_PENALTY = 16.0
+"""Log odds that a squared motion distance of 1 costs: a Gaussian prior with a standard deviation of 8°, or 6 % of the
+diameter sideways."""
+MIN_GAIN = 1.0
+"""Log odds by which another pose must be likelier than the tracked one."""
+FINAL_STAGES: tuple[Stage, ...] = SEARCH_STAGES[-2:]
+"""Schedule at full resolution of a pose found in a reduced window."""
 
 
 class _Window(NamedTuple):
@@ -86,13 +79,11 @@ class LocalSearchRecheck:
 
     Args:
         local: local search of the same part and camera, which is not changed.
-        options: see `RecheckOptions`.
     """
 
-    def __init__(self, local: LocalSearch, options: RecheckOptions | None = None) -> None:
-        self.options = options or RecheckOptions()
+    def __init__(self, local: LocalSearch) -> None:
         self._camera = local.camera
-        self._local = local.with_options(self.options.search)
+        self._local = local.with_options(SEARCH)
 
     def better(self, image: NDArray[np.uint8], cam_from_body: Array, predicted: Sequence[Array]) -> Array | None:
         """A pose (4,4) that is likelier than the tracked one; None if there is none.
@@ -112,24 +103,24 @@ class LocalSearchRecheck:
         if len(found) == 1:
             return None
         scores = [self._score(h, predicted[0]) for h in local.verify(picture, found)]
-        scores[0] += self.options.min_gain
+        scores[0] += MIN_GAIN
         best = int(np.argmax(scores))
         return self._refined(window, found[best].cam_from_body) if best > 0 else None
 
     def _hypotheses(self, local: LocalSearch, picture: ImagePyramid, poses: Sequence[Array]) -> list[Hypothesis]:
         """The tracked pose, which is the first of some poses (4,4), and what a search from all of them leads to."""
-        o, tracked = self.options, poses[0]
-        starts = local.pattern_search(picture, [PoseCandidate(1.0, pose) for pose in poses], o.kept)
-        scheduled = [(start.cam_from_body, stages) for start in starts for stages in o.search.fine_schedules]
-        first, *others = local.refine_through(picture, [(tracked, ()), *scheduled], o.search.fine_tolerance_px)
-        shown = [h for h in others if h.evidence.points_in_picture >= o.min_in_picture]
-        apart = local.deduplicate(shown, o.search.distinct_deg, o.search.max_verified)
-        same_mm = 0.01 * o.same_deg * self._local.views.diameter_mm
-        return [first, *(h for h in apart if not are_near(h.cam_from_body, tracked, same_mm, o.same_deg))]
+        tracked = poses[0]
+        starts = local.pattern_search(picture, [PoseCandidate(1.0, pose) for pose in poses], KEPT)
+        scheduled = [(start.cam_from_body, stages) for start in starts for stages in FINE_SCHEDULES]
+        first, *others = local.refine_through(picture, [(tracked, ()), *scheduled], FINE_TOLERANCE_PX)
+        shown = [h for h in others if h.evidence.points_in_picture >= MIN_IN_PICTURE]
+        apart = local.deduplicate(shown, DISTINCT_DEG, SEARCH.max_verified)
+        same_mm = 0.01 * SAME_DEG * self._local.views.diameter_mm
+        return [first, *(h for h in apart if not are_near(h.cam_from_body, tracked, same_mm, SAME_DEG))]
 
     def _score(self, hypothesis: Hypothesis, predicted: Array) -> float:
         """Log odds of a hypothesis, with the prior around the predicted pose (4,4)."""
-        return hypothesis.logit - self.options.motion_penalty * squared_motion_distance(
+        return hypothesis.logit - MOTION_PENALTY * squared_motion_distance(
             hypothesis.cam_from_body, predicted, self._local.views.diameter_mm
         )
 
@@ -139,7 +130,7 @@ class LocalSearchRecheck:
             return cam_from_body
         gray = smoothed(cv2.cvtColor(window.image, cv2.COLOR_RGB2GRAY))
         refiner = self._local.refiner.with_camera(window.camera)
-        return refiner.refine_fresh(window.image, gray, cam_from_body, self.options.final_stages)
+        return refiner.refine_fresh(window.image, gray, cam_from_body, FINAL_STAGES)
 
     def _window(self, image: NDArray[np.uint8], poses: Sequence[Array]) -> _Window | None:
         """The window of a picture (H,W,3) around the part at some poses (4,4).
@@ -148,17 +139,17 @@ class LocalSearchRecheck:
         """
         if any(pose[2, 3] <= 0 for pose in poses):
             return None
-        camera, o = self._camera, self.options
+        camera = self._camera
         centers = np.array([camera.project(pose[:3, 3]) for pose in poses])
         if not np.all(np.isfinite(centers)):
             return None
         radius_px = max(self._local.refiner.radius_px(pose) for pose in poses)
-        scale = min(1.0, o.radius_px / radius_px)
+        scale = min(1.0, RADIUS_PX / radius_px)
         size = np.array([camera.width, camera.height])
         middle = 0.5 * (centers.min(axis=0) + centers.max(axis=0))
         if np.any(middle < 0) or np.any(middle >= size):
             return None
-        wanted = scale * (np.ptp(centers, axis=0) + 2.0 * o.reach * radius_px) + 2.0 * o.margin_px
+        wanted = scale * (np.ptp(centers, axis=0) + 2.0 * REACH * radius_px) + 2.0 * MARGIN_PX
         steps = np.ceil(wanted / WINDOW_STEP_PX) * WINDOW_STEP_PX
         sides = np.minimum(np.round(steps / scale), size).astype(int)
         reduced = np.where(sides < size, steps, np.round(scale * sides)).astype(int)

@@ -14,8 +14,18 @@ from arview.detection.detector import Detector
 from arview.detection.scene_change import SceneChange
 from arview.guideviews import GuideViewSet
 from arview.pose import TrackingState
-from arview.tracking.session_options import SessionOptions
 from arview.tracking.session_state import SessionState
+
+EAGER_FRAMES = 2
+"""Frames after a loss in each of which the part is searched for."""
+SEARCH_EVERY = 3
+"""Later the part is searched for only so many frames after the last search."""
+THOROUGH_EVERY = 24
+"""Frames from the end of one thorough search for a lost part to the next."""
+THOROUGH_PARTS = 3
+"""Number of searches over which a thorough one is spread, so that no frame takes long."""
+MAX_UNCHANGED_FRAMES = 30
+"""Frames after which a picture in which nothing has changed is searched again."""
 
 
 class SearchPlan:
@@ -24,12 +34,10 @@ class SearchPlan:
     Args:
         views: guide views of the part.
         camera: of the frames.
-        options: of the session.
     """
 
-    def __init__(self, views: GuideViewSet, camera: Camera, options: SessionOptions) -> None:
-        self._options = options
-        self._scene = SceneChange(views, camera, options.scene_change)
+    def __init__(self, views: GuideViewSet, camera: Camera) -> None:
+        self._scene = SceneChange(views, camera)
 
     def searches(self, image: NDArray[np.uint8], state: SessionState, detector: Detector) -> list[int] | None:
         """The searches of the detector in this frame; None: all until one gives a sure result, empty: none.
@@ -39,20 +47,20 @@ class SearchPlan:
             state: of the session, in which the planned searches are noted.
             detector: of the part.
         """
-        o, s = self._options, state
+        s = state
         frame = s.frames_without_pose
         if s.state == TrackingState.SEARCHING:
-            return None if frame % (2 * o.search_every) == 1 else [0]
-        if frame > o.eager_frames and frame - s.last_search_frame < o.search_every:
+            return None if frame % (2 * SEARCH_EVERY) == 1 else [0]
+        if frame > EAGER_FRAMES and frame - s.last_search_frame < SEARCH_EVERY:
             return []
         picture = self._scene.reduced(image)
         is_known = s.searched_picture is not None and not self._scene.has_changed(s.searched_picture, picture)
-        is_known = is_known and frame - s.last_search_frame < o.max_unchanged_frames
+        is_known = is_known and frame - s.last_search_frame < MAX_UNCHANGED_FRAMES
         if not is_known:
             # Compared with this picture from now on, so that slow changes add up.
-            s.searched_picture, s.parts_left = picture, o.thorough_parts
-        searches = [] if is_known and frame > o.eager_frames else [0]
-        if s.parts_left and (s.thorough_part or frame >= max(s.next_thorough_frame, 2 * o.search_every)):
+            s.searched_picture, s.parts_left = picture, THOROUGH_PARTS
+        searches = [] if is_known and frame > EAGER_FRAMES else [0]
+        if s.parts_left and (s.thorough_part or frame >= max(s.next_thorough_frame, 2 * SEARCH_EVERY)):
             # A wider search finds what the quick one would find.
             searches = self._next_thorough_part(s, detector) or searches
         if searches:
@@ -61,14 +69,14 @@ class SearchPlan:
 
     def hides_parts(self, state: SessionState) -> bool:
         """Whether other parts are hidden in this frame: in every second round, as the part may stand on another."""
-        return state.frames_without_pose // (2 * self._options.search_every) % 2 == 0
+        return state.frames_without_pose // (2 * SEARCH_EVERY) % 2 == 0
 
     def _next_thorough_part(self, state: SessionState, detector: Detector) -> list[int]:
         """The next part of the thorough search for a lost part; after the last one it is done for a while."""
-        o, s = self._options, state
-        part = np.array_split(detector.wider_searches, o.thorough_parts)[s.thorough_part]
-        s.thorough_part = (s.thorough_part + 1) % o.thorough_parts
+        s = state
+        part = np.array_split(detector.wider_searches, THOROUGH_PARTS)[s.thorough_part]
+        s.thorough_part = (s.thorough_part + 1) % THOROUGH_PARTS
         s.parts_left -= 1
         if s.thorough_part == 0:
-            s.next_thorough_frame = s.frames_without_pose + o.thorough_every
+            s.next_thorough_frame = s.frames_without_pose + THOROUGH_EVERY
         return [int(k) for k in part]

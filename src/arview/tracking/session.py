@@ -37,12 +37,35 @@ from arview.tracking.estimate import Estimate
 from arview.tracking.guided_init import GuidedInit
 from arview.tracking.identity import IdentityMonitor
 from arview.tracking.pose_recheck import LocalSearchRecheck
-from arview.tracking.search_plan import SearchPlan
-from arview.tracking.session_options import SessionOptions
+from arview.tracking.search_plan import EAGER_FRAMES, SearchPlan
+from arview.tracking.session_options import CRITICAL_QUALITY, LOST_QUALITY, TRACKED_QUALITY, SessionOptions
 from arview.tracking.session_state import Event, SessionState
 from arview.tracking.several.specimens import CoveredPlace, is_same_specimen, searched_picture
 from arview.tracking.tracker import Tracker
 from arview.tracking.tracker_options import TrackerOptions
+
+ALTERNATIVE_SHARE = 0.25
+ALTERNATIVE_DEG = 8.0
+"""Distance in diameters and rotation from which another pose that was found is an alternative."""
+USE_BASE_DETECTION = True
+"""Search for the base alone where the search for the whole part fails."""
+LOCK_QUALITY = 0.8
+"""A detection of this quality is accepted at once; a weaker one must be confirmed by a second frame. Near a given
+initial pose ``TRACKED_QUALITY`` is enough."""
+LOST_FRAMES = 2
+"""Frames in a row below ``LOST_QUALITY`` after which the part is lost."""
+CRITICAL_FRAMES = 45
+"""Critical frames in a row after which the part is lost."""
+MIN_RESTING_SCORE = 0.7
+"""Correlation with the remembered appearance from which a place is examined in frames between these searches."""
+ALIGN_AGAIN_FRAMES = 60
+"""Frames after a loss from which the part may be aligned with the guide view again."""
+ALIGN_ADVICE_EVERY = 10
+"""Frames between two checks of the picture while the session waits for the alignment."""
+MIN_IN_PICTURE = 0.25
+"""Share of the outline inside the picture below which no pose is kept."""
+DISTANCE_MARGIN = 2.0
+"""Factor by which a pose may be nearer or farther than the declared range."""
 
 ALIGN = "align the part with the outline"
 """Reason given while the session waits for the part at its guide pose."""
@@ -116,15 +139,13 @@ class TrackingSession:
         self._initial = None if initial_cam_from_model is None else check_rigid(initial_cam_from_model, "initial pose")
         self._guide = None if guide_cam_from_model is None else check_rigid(guide_cam_from_model, "guide pose")
         self._guided_init: GuidedInit | None = None
-        self._base: BaseDetection = (
-            BaseDetection(views, camera, model, o.detector, o.base_detection) if like is None else like._base
-        )
+        self._base: BaseDetection = BaseDetection(views, camera, model, o.detector) if like is None else like._base
         self.components: AssemblyMonitor = AssemblyMonitor(
             views, camera, model, like=None if like is None else like.components
         )
         self.appearance_memory = AppearanceMemory(views, camera)
-        self._search_plan = SearchPlan(views, camera, o)
-        self.identity = IdentityMonitor(views, camera, o.identity, serials)
+        self._search_plan = SearchPlan(views, camera)
+        self.identity = IdentityMonitor(views, camera, serials)
         self._state = SessionState()
 
     def __repr__(self) -> str:
@@ -164,7 +185,7 @@ class TrackingSession:
     def is_aligning(self) -> bool:
         """Whether the part can be found by bringing it near the guide pose."""
         s = self._state
-        has_waited = s.state == TrackingState.LOST and s.frames_without_pose > self.options.align_again_frames
+        has_waited = s.state == TrackingState.LOST and s.frames_without_pose > ALIGN_AGAIN_FRAMES
         return self._guide is not None and (s.state == TrackingState.SEARCHING or has_waited)
 
     def reset(self) -> None:
@@ -212,7 +233,17 @@ class TrackingSession:
         ms = (time.perf_counter() - started) * 1e3
         if estimate is None:
             guide = self._guide if self.is_aligning else None
-            return Pose(None, None, 0.0, self.state, time_s, index, ms, reason, guide_cam_from_model=guide)
+            return Pose(
+                None,
+                None,
+                0.0,
+                state=self.state,
+                time_s=time_s,
+                index=index,
+                ms=ms,
+                reason=reason,
+                guide_cam_from_model=guide,
+            )
         pose = estimate.cam_from_model
         return Pose(
             cam_from_model=pose,
@@ -236,24 +267,24 @@ class TrackingSession:
 
     def _follow(self, image: NDArray[np.uint8]) -> tuple[Estimate | None, str]:
         """Track the part into this frame; the reason says why the pose is weak or was given up."""
-        o, s = self.options, self._state
+        s = self._state
         estimate = self.tracker.track(image)
         is_possible = self._is_possible(estimate)
-        is_outside = estimate.evidence.points_in_picture < o.min_in_picture or not is_possible
-        is_poor = is_outside or estimate.quality < o.lost_quality
+        is_outside = estimate.evidence.points_in_picture < MIN_IN_PICTURE or not is_possible
+        is_poor = is_outside or estimate.quality < LOST_QUALITY
         s.poor_frames = s.poor_frames + 1 if is_poor else 0
-        if s.poor_frames >= o.lost_frames or (is_poor and not s.is_confirmed):
+        if s.poor_frames >= LOST_FRAMES or (is_poor and not s.is_confirmed):
             recent = (s.recent_poses[0], s.recent_poses[1]) if len(s.recent_poses) == 2 else None
             return self._give_up(diagnose_loss(image, estimate, recent, self.camera, self.views, is_possible))
         if not is_poor:
             s.recent_poses = (*s.recent_poses[-1:], estimate.cam_from_model)
-            is_supported = estimate.quality >= (o.critical_quality if s.is_supported else o.tracked_quality)
+            is_supported = estimate.quality >= (CRITICAL_QUALITY if s.is_supported else TRACKED_QUALITY)
             if is_supported and not estimate.is_restless:
                 s.confirm()
                 return estimate, ""
         s.apply(Event.WEAK)
         s.critical_frames += 1
-        if s.critical_frames > o.critical_frames or not s.is_confirmed:
+        if s.critical_frames > CRITICAL_FRAMES or not s.is_confirmed:
             return self._give_up("the outline is not seen where it should be")
         return estimate, "the pose jumps" if estimate.is_restless else "the outline is hardly seen"
 
@@ -273,14 +304,14 @@ class TrackingSession:
         """Whether the part is in front of the camera and not much nearer or farther than declared."""
         center = apply(estimate.cam_from_model, self.views.center_in_model)
         low, high = self.views.view_range.distance_mm
-        margin = self.options.distance_margin
+        margin = DISTANCE_MARGIN
         return bool(center[2] > 0 and low / margin < np.linalg.norm(center) < margin * high)
 
     # --- Search -------------------------------------------------------------------------------------------
 
     def _search(self, image: NDArray[np.uint8]) -> tuple[Estimate | None, str]:
         """Find the part: at the initial pose, at the guide pose, or by detection; the reason says why not."""
-        o, s = self.options, self._state
+        s = self._state
         s.frames_without_pose += 1
         if self._initial is not None:
             return self._initialize(image, self._initial)
@@ -292,12 +323,12 @@ class TrackingSession:
         searched = searched_picture(image, self.others, covers, self.views, self.camera)
         detections = self._detect_remembered(searched) if is_resting else self._detect(searched, searches)
         detections = [one for one in detections if not self._is_other(one.cam_from_model)]
-        reason, is_bare = "", o.use_base_detection and self.components.may_be_bare
+        reason, is_bare = "", USE_BASE_DETECTION and self.components.may_be_bare
         if detections:
             found = detections[0]
             if is_bare and s.state == TrackingState.LOST:
                 found = self._as_before(image, found)
-            estimate, reason = self._begin_detected(image, found, o.lock_quality)
+            estimate, reason = self._begin_detected(image, found, LOCK_QUALITY)
             if estimate is not None or is_resting:
                 return estimate, reason
         if not is_resting:
@@ -329,9 +360,8 @@ class TrackingSession:
         """A detection, turned as the picture shows the components, and as the part lay before a short loss."""
         frames_lost = None if self.has_pose else self._state.frames_without_pose
         pose = self.components.best_turned(image, found.cam_from_model, frames_lost)
-        o = self._base.options
-        apart_mm = o.alternative_share * self.views.diameter_mm
-        others = [other for other in found.alternatives if not are_near(other, pose, apart_mm, o.alternative_deg)]
+        apart_mm = ALTERNATIVE_SHARE * self.views.diameter_mm
+        others = [other for other in found.alternatives if not are_near(other, pose, apart_mm, ALTERNATIVE_DEG)]
         return replace(found, cam_from_model=pose, alternatives=tuple(others))
 
     def _expect_base(self, cam_from_model: Array) -> None:
@@ -350,15 +380,14 @@ class TrackingSession:
         if found is None:
             return None, "the part is outside the picture at the initial pose"
         # Where the part should be is known, so that less can be mistaken for it than in a search.
-        return self._begin(image, found.cam_from_model, self.options.tracked_quality)
+        return self._begin(image, found.cam_from_model, TRACKED_QUALITY)
 
     def _begin(
         self, image: NDArray[np.uint8], cam_from_model: Array, lock_quality: float
     ) -> tuple[Estimate | None, str]:
         """Accept a found pose if it is good enough; one below a quality must be confirmed by the next frame."""
-        o = self.options
         estimate = self._restart(image, cam_from_model)
-        if estimate.quality < o.tracked_quality or not self._is_possible(estimate):
+        if estimate.quality < TRACKED_QUALITY or not self._is_possible(estimate):
             rejected = RejectedHypothesis(estimate.cam_from_model, estimate.evidence, estimate.quality)
             return None, self._diagnose(image, rejected)
         is_confirmed = estimate.quality >= lock_quality
@@ -379,7 +408,7 @@ class TrackingSession:
         o, s = self.options, self._state
         guesses: list[Array] = []
         if o.use_appearance_memory:
-            if s.last_sure_pose is not None and s.frames_without_pose <= o.eager_frames:
+            if s.last_sure_pose is not None and s.frames_without_pose <= EAGER_FRAMES:
                 guesses = self._remembered(image, s.last_sure_pose)
             guesses = guesses or self._remembered(image)
         return self.detector.detect(image, max_results=1, guesses=guesses, searches=searches)
@@ -389,7 +418,7 @@ class TrackingSession:
         near = self._state.last_sure_pose
         if not self.options.use_appearance_memory or near is None:
             return []
-        guesses = self._remembered(image, near, self.options.min_resting_score)
+        guesses = self._remembered(image, near, MIN_RESTING_SCORE)
         return self.detector.detect_near(image, guesses) if guesses else []
 
     def _remembered(self, image: NDArray[np.uint8], near: Array | None = None, min_score: float = 0.0) -> list[Array]:
@@ -399,16 +428,16 @@ class TrackingSession:
 
     def _align(self, image: NDArray[np.uint8], guide_cam_from_model: Array) -> tuple[Estimate | None, str]:
         """Find the part near the guide pose; what is found must be confirmed by the next frame."""
-        o, s = self.options, self._state
-        found = self.guided_init.lock(image, guide_cam_from_model, o.lock_quality)
+        s = self._state
+        found = self.guided_init.lock(image, guide_cam_from_model, LOCK_QUALITY)
         if found is not None:
             estimate = self._restart(image, found.cam_from_model)
-            is_good = estimate.quality >= o.lock_quality and self._is_possible(estimate)
+            is_good = estimate.quality >= LOCK_QUALITY and self._is_possible(estimate)
             if is_good and self.guided_init.is_near(estimate.cam_from_model, guide_cam_from_model):
                 s.reason = ALIGN
                 s.begin(is_confirmed=False)
                 return estimate, "found, to be confirmed"
-        if s.state == TrackingState.SEARCHING and s.frames_without_pose % o.align_advice_every == 1:
+        if s.state == TrackingState.SEARCHING and s.frames_without_pose % ALIGN_ADVICE_EVERY == 1:
             s.reason = diagnose_picture(image) or ALIGN
         return None, s.reason
 
@@ -427,7 +456,7 @@ class TrackingSession:
     def _disambiguate(self, image: NDArray[np.uint8], estimate: Estimate, reason: str) -> tuple[Estimate, str]:
         """Compare an ambiguous pose with its alternatives until the frames decide between them."""
         s = self._state
-        has_absent = self.options.use_base_detection and self.components.has_absent
+        has_absent = USE_BASE_DETECTION and self.components.has_absent
         if has_absent and self._base.is_recheck_due(self.components.is_bare, estimate.is_restless):
             estimate = self._recheck_base(image, estimate)
         if self.components.rests_on_base:
@@ -459,7 +488,7 @@ class TrackingSession:
 
     def _recheck_whole(self, image: NDArray[np.uint8], estimate: Estimate) -> Estimate:
         """Go on where the whole part is found, if only its base was found before and that elsewhere."""
-        pose, min_quality = estimate.cam_from_model, self.options.lock_quality
+        pose, min_quality = estimate.cam_from_model, LOCK_QUALITY
         found = self._base.find_whole(image, self.detector, self.components, pose, min_quality)
         if found is None or self._is_other(found.cam_from_model) or self._is_placed_by(found, estimate):
             return estimate

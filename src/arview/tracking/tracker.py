@@ -34,8 +34,66 @@ from arview.refinement.view_model import PartView
 from arview.tracking.estimate import Estimate
 from arview.tracking.motion import innovation, normalised_covariance, squared_motion_distance
 from arview.tracking.search.wide_search import WideSearch
-from arview.tracking.tracker_options import TrackerOptions
+from arview.tracking.tracker_options import SCALE, STAGES, TrackerOptions
 from arview.tracking.tracker_state import FrameContext, Proposal, RefinedPose, TrackerState
+
+USE_SHADING = True
+"""Use the brightness of curved surfaces."""
+MIN_MATCHES = 12
+"""Texture matches needed to use texture."""
+MIN_MATCH_SHARE = 0.4
+"""Share of the expected texture that must be found to use texture."""
+TEXTURE_SCORE = 0.5
+"""Score that texture adds to the quality when all of it is found, because it supports the pose where a hand hides the
+outline."""
+LEARNING_RATE = 0.2
+"""Share by which the colour histograms follow each frame."""
+MIN_LEARNING_QUALITY = 0.4
+"""Quality below which colours are not learned, and the part is searched for around the predicted pose."""
+SCORE_RATE = 0.1
+"""Share by which the usual score follows each frame."""
+OTHER_SCHEDULES_SHARE = 0.97
+"""Share of the usual score in the working picture below which other schedules are tried."""
+OTHER_SCHEDULES_FINE_SHARE = 0.85
+"""The same for the finest picture, in which scores vary more."""
+NEAR_SCHEDULES_MIN_INNER_SHARE = 0.05
+"""Share of design edges needed for schedules without colours, because the apparent outline of a rounded part moves with
+the light."""
+FAR_SCHEDULES_SHARE = 0.9
+"""Share of the usual score below which schedules for a part that moved far are tried."""
+WIDE_SEARCH_SHARE = 0.8
+"""Share of the usual score below which the part is searched for around the predicted pose."""
+SURPRISE_SHARE = 0.95
+"""The same for a pose whose squared motion distance exceeds ``SURPRISE``."""
+SURPRISE = 0.02
+"""Squared motion distance of a surprising pose; 0.02 is about 6°."""
+MOTION_PENALTY = 0.15
+"""Score that a squared motion distance of 1 costs, because turned parts often look alike."""
+MIN_GAIN = 0.02
+"""Score by which a pose found far from the predicted one must be better, and largest loss of score accepted from the
+shading refinement."""
+MIN_KEYFRAME_IN_PICTURE = 0.9
+"""Share of the outline in the picture needed for a keyframe. A part that enters the picture is located badly at first,
+and so would be all that is later matched with the keyframe."""
+MIN_KEYFRAME_QUALITY = 0.6
+"""Quality needed for a keyframe."""
+MIN_KEYFRAME_SUPPORT = 0.85
+"""Share of the best recent support of the outline needed for a keyframe; with less, something is in front of the
+part."""
+SUPPORT_DECAY = 0.99
+"""Factor by which the best recent support of the outline decreases in each frame."""
+EXPOSURE_GRID_PX = 16
+"""Distance of the pixels from which a change of exposure is measured."""
+EXPOSURE_DECAY = 0.9
+"""Exponent by which the estimated exposure fades, because the histograms follow slow changes."""
+EXPOSURE_LIMITS = (0.2, 5.0)
+"""Smallest and largest exposure relative to the first frame."""
+SPREAD_RATE = 0.3
+"""Share by which the estimated blur of the edges follows each frame."""
+CORRELATED_POINTS = 8.0
+"""Neighbouring edge points that share one error."""
+VELOCITY_DECAY = 0.9
+"""Share of the last frame's motion that is expected in the next frame."""
 
 
 class PoseRecheck(Protocol):
@@ -78,7 +136,7 @@ class Tracker:
         self.camera = camera
         self.refiner = PoseRefiner(part or PartView(views), camera, self.options)
         # Only edges gain from an enlarged picture.
-        self._scale = self.options.scale if self.options.use_edge else replace(self.options.scale, max_enlargement=1.0)
+        self._scale = SCALE if self.options.use_edge else replace(SCALE, max_enlargement=1.0)
         self._recheck = recheck
         self._search = WideSearch(self.refiner.part.arrays, camera, self.refiner.intrinsics, self.diameter_mm)
         self._state: TrackerState | None = None
@@ -126,8 +184,12 @@ class Tracker:
         """
         frame = self._prepare(image)
         for propose in (
-            self._predicted, self._other_schedules, self._searched, self._rechecked, self._shaded,
-        ):  # fmt: skip
+            self._predicted,
+            self._other_schedules,
+            self._searched,
+            self._rechecked,
+            self._shaded,
+        ):
             for proposal in propose(frame):
                 candidate = self._refine(frame, proposal)
                 if self._is_better(frame, candidate, proposal):
@@ -145,7 +207,7 @@ class Tracker:
         # Wide schedules may lock on to a stronger edge nearby, so they are left for where the near one fails. So is a
         # start from texture alone, which carries the error of the pose at which the texture was learned.
         o = self.options
-        yield Proposal(frame.predicted, LAST_STAGES if o.use_edge else o.stages, frame.matches, first_level=-1)
+        yield Proposal(frame.predicted, LAST_STAGES if o.use_edge else STAGES, frame.matches, first_level=-1)
 
     def _other_schedules(self, frame: FrameContext) -> Iterator[Proposal]:
         """Other schedules, where the scores are lower than usual."""
@@ -159,26 +221,26 @@ class Tracker:
             if self.state.is_started and self._is_usual(frame):
                 return
         for level in (-2, 0):
-            yield Proposal(frame.start, o.stages, frame.matches, first_level=level)
+            yield Proposal(frame.start, STAGES, frame.matches, first_level=level)
             if self.state.is_started and self._is_usual(frame):
                 return
-        if o.use_edge and first.evidence.inner_share > o.near_schedules_min_inner_share:
+        if o.use_edge and first.evidence.inner_share > NEAR_SCHEDULES_MIN_INNER_SHARE:
             yield Proposal(frame.start, NEAR_STAGES, frame.matches)
             yield Proposal(first.cam_from_body, NEAR_STAGES, frame.matches)
         for stages in FAR_STAGES:
-            if frame.found.evidence.score >= o.far_schedules_share * self.state.usual_score:
+            if frame.found.evidence.score >= FAR_SCHEDULES_SHARE * self.state.usual_score:
                 return
-            yield Proposal(frame.start, stages, frame.matches, o.min_gain)
+            yield Proposal(frame.start, stages, frame.matches, MIN_GAIN)
 
     def _searched(self, frame: FrameContext) -> Iterator[Proposal]:
         """Poses of a wide search around the predicted one, where the best pose so far is suspicious."""
         if not self._is_suspicious(frame):
             return
-        o, state = self.options, self.state
+        state = self.state
         starts = self._search.find(frame.image, state.appearance.colors, frame.predicted)
         frame.levels.cover(starts)
         for start in starts:
-            yield Proposal(start, o.stages, None, o.min_gain, o.motion_penalty)
+            yield Proposal(start, STAGES, None, MIN_GAIN, MOTION_PENALTY)
         # This score is usual from now on, because a search of the whole neighbourhood found nothing better.
         state.usual_score = frame.found.evidence.score
         state.usual_fine_score = frame.found.scores.fine_score
@@ -196,9 +258,9 @@ class Tracker:
 
     def _shaded(self, frame: FrameContext) -> Iterator[Proposal]:
         """The best pose so far, refined by the shading of a curved surface."""
-        if self.options.use_shading and self.refiner.part.is_curved:
+        if USE_SHADING and self.refiner.part.is_curved:
             best = frame.found
-            yield Proposal(best.cam_from_body, (), best.matches, -self.options.min_gain)
+            yield Proposal(best.cam_from_body, (), best.matches, -MIN_GAIN)
 
     # --- Refine, score, select ----------------------------------------------------------------------------
 
@@ -217,10 +279,10 @@ class Tracker:
 
     def _is_usual(self, frame: FrameContext) -> bool:
         """Whether the scores of the best pose so far are as usual in the working and in the finest picture."""
-        o, state = self.options, self.state
+        state = self.state
         return (
-            frame.found.evidence.score >= o.other_schedules_share * state.usual_score
-            and frame.found.scores.fine_score >= o.other_schedules_fine_share * state.usual_fine_score
+            frame.found.evidence.score >= OTHER_SCHEDULES_SHARE * state.usual_score
+            and frame.found.scores.fine_score >= OTHER_SCHEDULES_FINE_SHARE * state.usual_fine_score
         )
 
     def _is_better(self, frame: FrameContext, candidate: RefinedPose, proposal: Proposal) -> bool:
@@ -251,25 +313,23 @@ class Tracker:
 
     def _is_suspicious(self, frame: FrameContext) -> bool:
         """Whether the best pose may be wrong: its score is low, or lower than usual, or it is off the prediction."""
-        o, evidence = self.options, frame.found.evidence
+        evidence = frame.found.evidence
         share = evidence.score / max(self.state.usual_score, 1e-6)
-        is_less = share < o.wide_search_share or (
-            share < o.surprise_share and self._motion(frame, frame.found) > o.surprise
-        )
-        return is_less or evidence.quality < o.min_learning_quality
+        is_less = share < WIDE_SEARCH_SHARE or (share < SURPRISE_SHARE and self._motion(frame, frame.found) > SURPRISE)
+        return is_less or evidence.quality < MIN_LEARNING_QUALITY
 
     def _quality(self, frame: FrameContext) -> float:
         """Quality of the selected pose by the evidence of edges and colours, and by texture."""
         evidence = frame.found.evidence
         if frame.found.matches is not None and evidence.points_in_picture > MIN_IN_PICTURE:
-            return quality_of(evidence.score + self.options.texture_score * frame.found_share)
+            return quality_of(evidence.score + TEXTURE_SCORE * frame.found_share)
         return evidence.quality
 
     # --- State --------------------------------------------------------------------------------------------
 
     def _prepare(self, image: NDArray[np.uint8]) -> FrameContext:
         """A frame with its predicted pose and the texture found in it."""
-        state, o = self.state, self.options
+        state = self.state
         self._follow_exposure(image[..., 1])
         predicted = apply_twist(state.cam_from_body, state.velocity)
         frame = FrameContext(image, self._levels(image, [state.cam_from_body, predicted]), predicted, predicted)
@@ -277,7 +337,7 @@ class Tracker:
             frame.pyramid = self._texture.pyramid(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
             matches = self._texture.measure(frame.pyramid, predicted)
             frame.found_share = len(matches.weights) / max(matches.tried, 1)
-            if len(matches.weights) >= o.min_matches and frame.found_share >= o.min_match_share:
+            if len(matches.weights) >= MIN_MATCHES and frame.found_share >= MIN_MATCH_SHARE:
                 frame.matches, frame.start = matches, self._texture.align(matches, predicted)
         return frame
 
@@ -288,17 +348,17 @@ class Tracker:
         fine_score = frame.found.scores.fine_score
         if state.is_started:
             state.motion.learn(*self._innovation(frame), frame.is_rechecked)
-            state.usual_score += o.score_rate * (evidence.score - state.usual_score)
-            state.usual_fine_score += o.score_rate * (fine_score - state.usual_fine_score)
-            state.velocity = o.velocity_decay * relative_twist(state.cam_from_body, pose)
+            state.usual_score += SCORE_RATE * (evidence.score - state.usual_score)
+            state.usual_fine_score += SCORE_RATE * (fine_score - state.usual_fine_score)
+            state.velocity = VELOCITY_DECAY * relative_twist(state.cam_from_body, pose)
         else:
             # The start may have been off, so neither its scores nor the motion from it mean anything.
             state.is_started, state.usual_score, state.usual_fine_score = True, evidence.score, fine_score
         state.cam_from_body = pose
-        self._measure_spread(frame.levels, o.spread_rate)
-        if quality > o.min_learning_quality:
+        self._measure_spread(frame.levels, SPREAD_RATE)
+        if quality > MIN_LEARNING_QUALITY:
             if o.use_region:
-                frame.levels.finest_colors.learn_colors(pose, state.appearance, o.learning_rate)
+                frame.levels.finest_colors.learn_colors(pose, state.appearance, LEARNING_RATE)
             if self._texture is not None:
                 self._remember_texture(frame)
 
@@ -307,14 +367,14 @@ class Tracker:
 
         The change is the median ratio of the brightness of a colour channel (H,W) on a coarse grid.
         """
-        o, state = self.options, self.state
-        step = o.exposure_grid_px
+        state = self.state
+        step = EXPOSURE_GRID_PX
         if state.sparse_gray is None:
             state.sparse_gray = np.zeros((channel.shape[0] // step, channel.shape[1] // step))
         ratio = median_brightness_ratio(channel, state.sparse_gray, step)
         if ratio != 1.0 or state.exposure != 1.0:
-            low, high = o.exposure_limits
-            state.exposure = min(max(state.exposure**o.exposure_decay * ratio, low), high)
+            low, high = EXPOSURE_LIMITS
+            state.exposure = min(max(state.exposure**EXPOSURE_DECAY * ratio, low), high)
             state.appearance.bin_of = value_bins(state.exposure)
 
     def _levels(self, image: NDArray[np.uint8], poses: list[Array]) -> RefinementPyramid:
@@ -331,18 +391,18 @@ class Tracker:
     def _remember_texture(self, frame: FrameContext) -> None:
         """Update the trust in the keyframes, and add one where it is missing and nothing hides the outline."""
         assert self._texture is not None and frame.pyramid is not None
-        o, state, best = self.options, self.state, frame.found
+        state, best = self.state, frame.found
         pose, evidence, matches = best.cam_from_body, best.evidence, best.matches
         if matches is not None:
             self._texture.update_trust(pose)
-        state.best_contour_support = max(o.support_decay * state.best_contour_support, evidence.contour_support)
-        is_unhidden = evidence.contour_support > o.min_keyframe_support * state.best_contour_support
-        is_unhidden &= evidence.points_in_picture > o.min_keyframe_in_picture
+        state.best_contour_support = max(SUPPORT_DECAY * state.best_contour_support, evidence.contour_support)
+        is_unhidden = evidence.contour_support > MIN_KEYFRAME_SUPPORT * state.best_contour_support
+        is_unhidden &= evidence.points_in_picture > MIN_KEYFRAME_IN_PICTURE
         tracked_count = 0 if matches is None else len(matches.weights)
         if (
             is_unhidden
             and state.motion.is_calm
-            and evidence.quality > o.min_keyframe_quality
+            and evidence.quality > MIN_KEYFRAME_QUALITY
             and self._texture.wants_keyframe(pose, tracked_count)
         ):
             self._texture.add_keyframe(frame.pyramid, pose)
@@ -351,7 +411,7 @@ class Tracker:
 
     def scores_near(self, image: NDArray[np.uint8], cams_from_model: list[Array]) -> list[float]:
         """Scores, see `PoseScores.mean`, of poses (4,4) in the last frame, each after a fine refinement."""
-        appearance, fine = self.state.appearance, self.options.stages[-2:]
+        appearance, fine = self.state.appearance, STAGES[-2:]
         in_body = [pose @ self.refiner.part.model_from_body for pose in cams_from_model]
         levels = self._levels(image, in_body)
         poses = [levels.refine(pose, fine, appearance, first=-1)[0] for pose in in_body]
@@ -367,7 +427,7 @@ class Tracker:
 
     def _covariance(self, information: Array, quality: float) -> Array:
         """Covariance (6,6) for an information (6,6) and the quality of its pose, see `covariance`."""
-        scale = self.options.correlated_points / max(quality, 0.05)
+        scale = CORRELATED_POINTS / max(quality, 0.05)
         max_sigma = np.array([0.5] * 3 + [0.5 * self.diameter_mm] * 3)
         covariance = np.linalg.inv(information / scale + np.diag(1.0 / max_sigma**2))
         return np.asarray(covariance, dtype=np.float64)

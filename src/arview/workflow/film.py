@@ -44,9 +44,14 @@ def camera_of_video(video: str, spec: str | None, of_photos: Camera | None, is_f
 
 
 def make_film(
-    video: str, part: Part, camera: Camera, inspection: Inspection, film: Path, poses: Path,
+    video: str,
+    part: Part,
+    camera: Camera,
+    inspection: Inspection,
+    film: Path,
+    poses: Path,
     progress: StepProgress,
-) -> str:  # fmt: skip
+) -> str:
     """Track the part through a video and draw the inspection; returns in how many frames the part was tracked.
 
     Both files are written atomically, also when Ctrl-C interrupts.

@@ -74,6 +74,12 @@ def _component(part: Part, name: str, value: ListedComponent | None, label: str)
         verdict = Verdict.UNDECIDED  # a displacement along the undetermined axis would enlarge the distance
     dx, dy, dz = (float(one) if is_known else None for one, is_known in zip(moved, known, strict=True))
     return ComponentDeviation(
-        name, (dx, dy, dz), distance, (False, False, False, bool(known[0]), bool(known[1]), bool(known[2])),
-        uncertainty, tolerance_mm, verdict, details=details,
-    )  # fmt: skip
+        name,
+        (dx, dy, dz),
+        distance,
+        (False, False, False, bool(known[0]), bool(known[1]), bool(known[2])),
+        uncertainty,
+        tolerance_mm,
+        verdict,
+        details=details,
+    )

@@ -107,12 +107,29 @@ def measurement_key(prepared: Prepared) -> str:
     made = None if reconstruct.silhouettes is None else reconstruct.silhouettes.key()
     poses = [(one.name, one.cam_from_scan.tolist()) for one in read_poses(job.sparse)] if job.sparse else []
     return key_of(
-        content_key(photos), content_key(masks), made, poses, job.compares_halves, _content(job.camera),
-        part.model.source_hash, part.name, part.settings,
-        part.datums, part.serial, part.effective_view_range, replace(options, maps_folder=None),
-        replace(reconstruct, masks=None, silhouettes=None, poses=None, sparse=replace(reconstruct.sparse, threads=0),
-                dense=replace(reconstruct.dense, threads=0)), __version__,
-    )  # fmt: skip
+        content_key(photos),
+        content_key(masks),
+        made,
+        poses,
+        job.compares_halves,
+        _content(job.camera),
+        part.model.source_hash,
+        part.name,
+        part.settings,
+        part.datums,
+        part.serial,
+        part.effective_view_range,
+        replace(options, maps_folder=None),
+        replace(
+            reconstruct,
+            masks=None,
+            silhouettes=None,
+            poses=None,
+            sparse=replace(reconstruct.sparse, threads=0),
+            dense=replace(reconstruct.dense, threads=0),
+        ),
+        __version__,
+    )
 
 
 def job_key(prepared: Prepared) -> str:

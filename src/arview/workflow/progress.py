@@ -66,9 +66,13 @@ class ProgressEstimator:
     """
 
     def __init__(
-        self, show: Callable[[ProgressEstimate], None], has_video_frames: bool = True, has_film: bool = True,
-        has_pdf: bool = True, now: Callable[[], float] = time.monotonic,
-    ) -> None:  # fmt: skip
+        self,
+        show: Callable[[ProgressEstimate], None],
+        has_video_frames: bool = True,
+        has_film: bool = True,
+        has_pdf: bool = True,
+        now: Callable[[], float] = time.monotonic,
+    ) -> None:
         left_out = {"frames": not has_video_frames, "film": not has_film, "PDF": not has_pdf}
         self._steps = [(name, cost) for name, cost in STEPS if not left_out.get(name, False)]
         self._show, self._now = show, now
@@ -101,8 +105,14 @@ class ProgressEstimator:
         return ProgressEstimate(step, share, passed, left)
 
     def _index(self, what: str) -> int | None:
-        return next((i for i, (name, _) in enumerate(self._steps)
-                     if what == name or (name == "depth maps" and what.startswith(name))), None)  # fmt: skip
+        return next(
+            (
+                i
+                for i, (name, _) in enumerate(self._steps)
+                if what == name or (name == "depth maps" and what.startswith(name))
+            ),
+            None,
+        )
 
 
 def time_text(estimate: ProgressEstimate) -> str:

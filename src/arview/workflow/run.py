@@ -35,9 +35,13 @@ from arview.workflow.lock import exclusive_access
 from arview.workflow.prepare import Prepared, measurement_key, prepare
 
 RESULTS = (
-    "report.html", "report.pdf", "annotated.mp4", "poses.jsonl", "inspection.json",
+    "report.html",
+    "report.pdf",
+    "annotated.mp4",
+    "poses.jsonl",
+    "inspection.json",
     "inspection_distances/distances.ply",
-)  # fmt: skip
+)
 _RECONSTRUCTION = {"photos": "photos", "sparse": "camera poses", "scale": "scale and CAD frame", "dense": "dense cloud"}
 
 
@@ -113,9 +117,14 @@ def inspect_part(
 
 
 def inspect_prepared(
-    prepared: Prepared, folder: Path, *, progress: Progress | None = None, starts_over: bool = False,
-    memory: SparseMemory | None = None, on_verdict: Callable[[Inspection], None] | None = None,
-) -> Outcome:  # fmt: skip
+    prepared: Prepared,
+    folder: Path,
+    *,
+    progress: Progress | None = None,
+    starts_over: bool = False,
+    memory: SparseMemory | None = None,
+    on_verdict: Callable[[Inspection], None] | None = None,
+) -> Outcome:
     """Inspect one part as `inspect_part` does, from inputs that are read and checked.
 
     Args:
@@ -165,19 +174,27 @@ class _InspectionRun:
         self._report()
         self._film(found, inspection)
         return Outcome(
-            self.folder, inspection, tuple(self.records),
+            self.folder,
+            inspection,
+            tuple(self.records),
             tuple(path for path in (self.folder / name for name in (*RESULTS, "cloud.ply")) if path.is_file()),
-            tuple(dict.fromkeys([*self.warnings, *inspection.warnings])), _peak_memory_mb(),
-        )  # fmt: skip
+            tuple(dict.fromkeys([*self.warnings, *inspection.warnings])),
+            _peak_memory_mb(),
+        )
 
     def _reconstruct(self, starts_over: bool) -> Reconstruction:
         prepared, job = self.prepared, self.prepared.job
         options = replace(prepared.reconstruct, starts_over=starts_over)
         with _measuring():
             found = reconstruct(
-                job.photo_source, self.folder, prepared.part, job.camera, options, progress=self.progress,
+                job.photo_source,
+                self.folder,
+                prepared.part,
+                job.camera,
+                options,
+                progress=self.progress,
                 memory=self.memory,
-            )  # fmt: skip
+            )
         for name, title in _RECONSTRUCTION.items():
             state = "done" if name in found.seconds else "kept"
             self.records.append(StageRecord(title, state, found.seconds.get(name, 0.0), _about(found, name)))
@@ -192,9 +209,14 @@ class _InspectionRun:
         if self.stages.key("measure") is None or starts_over:
             with _measuring():
                 found = reconstruct(
-                    job.photo_source, self.folder, prepared.part, job.camera, options, progress=self.progress,
+                    job.photo_source,
+                    self.folder,
+                    prepared.part,
+                    job.camera,
+                    options,
+                    progress=self.progress,
                     memory=self.memory,
-                )  # fmt: skip
+                )
             self.stages = Stages(self.folder)
             key = key_of(inputs, self.stages.key("scale"))
             if not self.stages.is_finished("verdict", key) or not path.is_file():
@@ -257,14 +279,24 @@ class _InspectionRun:
             camera, warning = camera_of_video(video, spec, of_photos, job.is_from_video)
             self.warnings += [warning] if warning else []
             key = key_of(
-                content_key([Path(video), self.folder / "inspection.json"]), camera.width, camera.height,
-                camera.matrix.tolist(), camera.dist.tolist(), str(camera.lens), part.effective_view_range, __version__,
-            )  # fmt: skip
+                content_key([Path(video), self.folder / "inspection.json"]),
+                camera.width,
+                camera.height,
+                camera.matrix.tolist(),
+                camera.dist.tolist(),
+                str(camera.lens),
+                part.effective_view_range,
+                __version__,
+            )
             self._once(
-                "film", "film", key, [film, poses],
-                lambda: make_film(video, part, camera, inspection, film, poses,
-                                  lambda done, total: self.progress("film", done, total)),
-            )  # fmt: skip
+                "film",
+                "film",
+                key,
+                [film, poses],
+                lambda: make_film(
+                    video, part, camera, inspection, film, poses, lambda done, total: self.progress("film", done, total)
+                ),
+            )
         except (InputError, MismatchError) as error:  # the measurement is valid without the film
             for old in (film, poses):
                 old.unlink(missing_ok=True)

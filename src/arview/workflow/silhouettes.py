@@ -28,23 +28,28 @@ from arview.guideviews.cache import cached_guide_views
 from arview.reconstruction.intake.reading import read_photo
 from arview.reconstruction.part_masks import PartMasks
 from arview.reconstruction.scale import CadOptions, find_scale
-from arview.reconstruction.scale.cad import search_ranges, shrunk
+from arview.reconstruction.scale.cad import DETECT_WIDTH_PX, SPANS, SUBDIVISIONS, search_ranges, shrunk
 from arview.reconstruction.types import Photo, SparseModel
 from arview.rendering.rasterizer import rasterise
 from arview.version import __version__
+
+MARGIN_MM = 10.0
+"""Around the silhouette: twice the search range of the measurement and of the dense cloud."""
+PLACING_MARGIN_MM = 0.0
+"""The same where photos are placed by the part alone: any background misleads them."""
+MAX_SIDE_PX = 1000
+"""Longer side of the masks; they are scaled to their photos."""
+MAX_STRETCH = 3.0
+"""Largest field of the undistorted view, relative to the photo."""
+ROUGH = CadOptions(max_views=6, rival_views=4, max_side_px=800)
 
 
 @dataclass(frozen=True)
 class SilhouetteOptions:
     """Size and margin of the masks, and how the part is found for them."""
 
-    margin_mm: float = 10.0  # around the silhouette: twice the search range of the measurement and of the dense cloud
-    placing_margin_mm: float = 0.0  # the same where photos are placed by the part alone: any background misleads them
     edge_px: float = 2.0  # added to ``margin_mm`` for the reduced size of the masks
-    max_side_px: int = 1000  # longer side of the masks; they are scaled to their photos
-    max_stretch: float = 3.0  # largest field of the undistorted view, relative to the photo
     # Rough placing is enough, because the margin covers its error.
-    rough: CadOptions = field(default_factory=lambda: CadOptions(max_views=6, rival_views=4, max_side_px=800))
 
 
 @dataclass(frozen=True)
@@ -60,27 +65,29 @@ class CadSilhouettes:
 
     def at_poses(self, sparse: SparseModel, folder: Path, tell: Progress) -> PartMasks:
         """Masks of the placed photos in which the part is; none if it is not found, or contradicts the poses."""
-        found = find_scale(sparse, self.part, options=self.options.rough, progress=tell)
+        found = find_scale(sparse, self.part, options=ROUGH, progress=tell)
         if found.scale is None or found.model_from_scan is None:
             return PartMasks(f"the CAD was not found at the poses of the photos ({found.why_no_frame})")
         metric = sparse.transformed(found.scale, found.model_from_scan)
         poses = {photo.name: (photo.camera, photo.cam_from_scan) for photo in metric.photos}
-        return self._written(poses, folder, self.options.margin_mm)
+        return self._written(poses, folder, MARGIN_MM)
 
     def in_photos(self, photos: Sequence[Photo], folder: Path, tell: Progress) -> PartMasks:
         """Masks of the photos in which the part is found, each by itself."""
         poses: dict[str, tuple[Camera, Array]] = {}
-        for view_range in search_ranges(self.part, [photo.camera for photo in photos], self.options.rough.spans):
+        for view_range in search_ranges(self.part, [photo.camera for photo in photos], SPANS):
             views = cached_guide_views(
-                self.part.model, view_range, GuideViewOptions(subdivisions=self.options.rough.subdivisions),
+                self.part.model,
+                view_range,
+                GuideViewOptions(subdivisions=SUBDIVISIONS),
                 progress=lambda done, total: tell("guide views", done, total),
-            )  # fmt: skip
+            )
             detectors: dict[str, Detector] = {}
             for done, photo in enumerate(photos):
                 tell("finding the part", done, len(photos))
                 if photo.name in poses:
                     continue
-                camera, image = shrunk(photo.camera, read_photo(photo.path), self.options.rough.detect_width_px)
+                camera, image = shrunk(photo.camera, read_photo(photo.path), DETECT_WIDTH_PX)
                 key = key_of(camera)
                 if key not in detectors:
                     detectors[key] = Detector(views, camera)
@@ -89,7 +96,7 @@ class CadSilhouettes:
                     poses[photo.name] = (photo.camera, found[0].cam_from_model)
             if 2 * len(poses) >= len(photos):
                 break
-        return self._written(poses, folder, self.options.placing_margin_mm)
+        return self._written(poses, folder, PLACING_MARGIN_MM)
 
     def _written(self, poses: dict[str, tuple[Camera, Array]], folder: Path, margin_mm: float) -> PartMasks:
         """The masks at poses ``cam_from_model``, as files; photos in which nothing of the part is seen have none."""
@@ -129,11 +136,11 @@ def silhouette_mask(
         options: see `SilhouetteOptions`.
     """
     options = options or SilhouetteOptions()
-    scale = min(1.0, options.max_side_px / max(camera.width, camera.height))
+    scale = min(1.0, MAX_SIDE_PX / max(camera.width, camera.height))
     small = camera.scaled(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
     columns, rows = np.meshgrid(np.arange(small.width), np.arange(small.height))
     rays = small.unproject(np.stack([columns, rows], axis=-1).astype(np.float64))[..., :2]
-    reach = options.max_stretch * np.array([small.width, small.height]) / (2.0 * np.array([small.fx, small.fy]))
+    reach = MAX_STRETCH * np.array([small.width, small.height]) / (2.0 * np.array([small.fx, small.fy]))
     in_field = np.asarray(np.isfinite(rays).all(axis=-1) & (np.abs(rays) <= reach).all(axis=-1))
     ideal = np.where(in_field[..., None], rays, 0.0) * (small.fx, small.fy)
     low, high = np.floor(ideal.min(axis=(0, 1))) - 1.0, np.ceil(ideal.max(axis=(0, 1))) + 1.0
@@ -144,8 +151,8 @@ def silhouette_mask(
     pad = int(np.ceil(min(reach_px, 0.5 * max(small.width, small.height))))
     low, (width, height) = low - pad, (high - low + 1 + 2 * pad).astype(int)
     inverse_depth, _ = rasterise(
-        vertices, model.mesh[1], small.fx, small.fy, -low[0], -low[1], int(width), int(height)
-    )  # fmt: skip
+        vertices, model.mesh[1], small.fx, fy=small.fy, cx=-low[0], cy=-low[1], width=int(width), height=int(height)
+    )
     if not (inverse_depth > 0).any():
         return np.zeros(columns.shape, dtype=np.bool_)
     distance = cv2.distanceTransform((inverse_depth <= 0).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)

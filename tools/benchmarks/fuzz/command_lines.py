@@ -17,7 +17,7 @@ from seeds import make_seeds
 from arview.cli import main
 
 LEFT_OUT = {"live", "studio", "study", "warmup", "batch"}
-"""Commands that run for long or start other processes: their options are tested by name in tests/live and tests/cli."""
+"""Commands that run for long or start other processes: their options are tested by name in tests/station/live and tests/cli."""
 TEXTS = (
     "",
     "-1",
@@ -59,8 +59,10 @@ CODES = {0, 1, 2, 3, 64}
 def commands(group: click.Group, prefix: tuple[str, ...] = ()) -> list[tuple[tuple[str, ...], click.Command]]:
     """All commands with their names."""
     found: list[tuple[tuple[str, ...], click.Command]] = []
-    for name, command in sorted(group.commands.items()):
-        if name in LEFT_OUT:
+    context = click.Context(group)
+    for name in group.list_commands(context):
+        command = group.get_command(context, name)
+        if name in LEFT_OUT or command is None:
             continue
         if isinstance(command, click.Group):
             found += commands(command, (*prefix, name))

@@ -26,12 +26,12 @@ from arview.guideviews import load_guide_views
 from arview.inspection import load_inspection
 from arview.inspection.export import to_csv, to_dfq, to_qif
 from arview.measurement.cloud.reading.files import read_points
+from arview.quality.batch.jobs_file import load_jobs
 from arview.reconstruction.given_poses import read_poses
 from arview.reconstruction.intake.reading import glance, read_photo
 from arview.reconstruction.scale.specs import load_rig, load_scale_file
 from arview.tracking.appearance_file import load_views
 from arview.video import open_source
-from arview.workflow.jobs_file import load_jobs
 from helpers.paths import SHARED, TESTS
 
 MAX_FRAMES = 40

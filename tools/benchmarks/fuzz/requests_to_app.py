@@ -14,11 +14,11 @@ from mutations import CHANGES, changed
 from seeds import make_seeds
 
 from arview.guideviews import GuideViewOptions
-from arview.live.options import JobOptions, LiveOptions, RequestLimits
-from arview.live.security.access import Access
-from arview.live.server.app import make_app
-from arview.live.server.hub import Hub
-from arview.live.server.loading import load_subjects
+from arview.station.live.options import JobOptions, LiveOptions, RequestLimits
+from arview.station.live.security.access import Access
+from arview.station.live.server.app import make_app
+from arview.station.live.server.hub import Hub
+from arview.station.live.server.loading import load_subjects
 
 HOST = "127.0.0.1:8443"
 PIECES = (

@@ -14,9 +14,9 @@ from mutations import CHANGES, changed
 from requests_to_app import HEADERS, HOST, ask, check_answer
 from seeds import PART, make_seeds
 
-from arview.live.security.access import Access
-from arview.studio import app as studio
-from arview.studio.document import StudioDocument
+from arview.station.live.security.access import Access
+from arview.station.studio import app as studio
+from arview.station.studio.document import StudioDocument
 
 GETS = (
     "/",

@@ -132,7 +132,7 @@ def _scene(folder: Path) -> tuple[SparseModel, Cad]:
 
 def _views(sparse: SparseModel, nominal: Cad, options: DenseOptions) -> list[DenseView]:
     """The photos as the dense stage has them; all of them have sources."""
-    sources = choose_sources(sparse, options)
+    sources = choose_sources(sparse)
     made = [
         make_view(sparse, i, sources[i], nominal, options, lambda photo: read_photo(photo.path))
         for i in range(len(sparse.photos))

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from arview.cad.model import Model
 from arview.camera import Camera
-from arview.evaluation.semisynthetic.backgrounds import read_photo, surroundings
-from arview.evaluation.semisynthetic.sequence import JOIN_BLUR_PX, generator, paste, scene_lights
-from arview.evaluation.semisynthetic.shading import Light, ShadedModel
 from arview.geometry import Array, apply, exp_so3, rigid
 from arview.video import Image
+from arview_lab.semisynthetic.backgrounds import read_photo, surroundings
+from arview_lab.semisynthetic.sequence import JOIN_BLUR_PX, generator, paste, scene_lights
+from arview_lab.semisynthetic.shading import Light, ShadedModel
 
 Kind = Literal["covered", "taken away", "out of view"]
 """The followed specimen is covered by a board; the same, and is gone afterwards; the camera turns away from it."""

@@ -19,10 +19,6 @@ import numpy as np
 
 from arview.cad import Part, load_part
 from arview.camera import Camera
-from arview.capture.dome import component_points
-from arview.capture.information import Views, choose_views, focal_px
-from arview.capture.needs import component_weights
-from arview.capture.options import CaptureOptions
 from arview.errors import ArviewError
 from arview.geometry import Array, rigid
 from arview.measurement.folder import MetricReconstruction, read_folder
@@ -30,6 +26,10 @@ from arview.measurement.options import MeasureOptions
 from arview.measurement.run import measure
 from arview.reconstruction.coverage import components_seen, unit
 from arview.reconstruction.halves import adjusted_alone
+from arview.station.capture.dome import component_points
+from arview.station.capture.information import Views, choose_views, focal_px
+from arview.station.capture.needs import component_weights
+from arview.station.capture.options import MAX_STEP_DEG
 from recordings import ROOT, PhotoSet, photo_sets, skip
 from rows import ResultRow, watched
 from suites.measurement import component_error
@@ -110,7 +110,7 @@ class _Trial:
         start, rest = list(range(START)), list(range(START, self.available))
         order = choose_views(
             views[start], views[rest], component_weights(self._part), directions[rest], list(directions[start]),
-            count - START, CaptureOptions().max_step_deg,
+            count - START, MAX_STEP_DEG,
         )  # fmt: skip
         return sorted([*start, *(rest[index] for index in order)])
 

@@ -11,8 +11,14 @@ from typing import Any
 
 from arview.cad import Model, ViewRange, load_part
 from arview.detection import Detector
-from arview.evaluation import PoseError, PoseMeter, Scene, SceneFrame, load_scene
-from arview.evaluation.protocols import (
+from arview.geometry import Array, apply
+from arview.guideviews import GuideViewSet
+from arview.guideviews.cache import cached_guide_views
+from arview.pose import TrackingState
+from arview.tracking import TrackingSession
+from arview.video import Image
+from arview_lab.evaluation import PoseError, PoseMeter, Scene, SceneFrame, load_scene
+from arview_lab.evaluation.protocols import (
     Tally,
     box_symmetries,
     detect_in_frames,
@@ -21,7 +27,7 @@ from arview.evaluation.protocols import (
     track_with_resets,
     true_pose,
 )
-from arview.evaluation.semisynthetic import (
+from arview_lab.semisynthetic import (
     SHAPES,
     VARIANTS,
     WALK_ROUND,
@@ -38,12 +44,6 @@ from arview.evaluation.semisynthetic import (
     shape,
     shape_job,
 )
-from arview.geometry import Array, apply
-from arview.guideviews import GuideViewSet
-from arview.guideviews.cache import cached_guide_views
-from arview.pose import TrackingState
-from arview.tracking import TrackingSession
-from arview.video import Image
 from photos import all_photos, background_photos
 from recordings import PHOTO_SEQUENCES, SAMPLE, VIDEOS
 from rows import ResultRow, timing, watched

@@ -6,12 +6,12 @@ import time
 
 import numpy as np
 
-from arview.evaluation import PoseMeter, Scene, scene_guide_views
-from arview.evaluation.protocols import box_symmetries
 from arview.geometry import Array, apply, exp_so3, rigid, rotation_angle_rad
-from arview.tracking import SessionOptions
 from arview.tracking.guided_init import GuidedInit
+from arview.tracking.session import LOCK_QUALITY
 from arview.video import Image
+from arview_lab.evaluation import PoseMeter, Scene, scene_guide_views
+from arview_lab.evaluation.protocols import box_symmetries
 from rows import ResultRow, timing, watched
 from suites.detection import BOXES
 
@@ -86,7 +86,7 @@ class _GuidedInitTrial:
     def try_at(self, image: Image, guide: Array, truth: Array | None) -> bool | None:
         """Whether the pose that guided initialisation locks on is right; None when it does not lock."""
         began = time.perf_counter()
-        found = self.guided_init.lock(image, guide, SessionOptions.lock_quality)
+        found = self.guided_init.lock(image, guide, LOCK_QUALITY)
         self.ms.append(1000.0 * (time.perf_counter() - began))
         if found is None:
             return None

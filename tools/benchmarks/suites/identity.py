@@ -17,9 +17,6 @@ from arview.cad import load_part
 from arview.cad.model import Model
 from arview.camera import Camera
 from arview.camera.read import load_camera
-from arview.evaluation import Scene
-from arview.evaluation.semisynthetic import shape
-from arview.evaluation.semisynthetic.random_solids import random_solid
 from arview.geometry import Array, apply
 from arview.guideviews import GuideViewSet
 from arview.guideviews.cache import cached_guide_views
@@ -27,6 +24,9 @@ from arview.pose import Pose, TrackingState
 from arview.tracking import TrackingSession
 from arview.video import Image
 from arview.video.sources import open_source
+from arview_lab.evaluation import Scene
+from arview_lab.semisynthetic import shape
+from arview_lab.semisynthetic.random_solids import random_solid
 from photos import background_photos
 from recordings import ROOT, SHARED, skip
 from rows import ResultRow, watched

@@ -19,7 +19,6 @@ from arview.geometry import Array, apply, rigid, rotation_angle_rad
 from arview.inspection import ComponentDeviation, Details, MethodResult, Verdict, load_inspection
 from arview.measurement.datums.alignment import align
 from arview.measurement.datums.in_photos import measure_datums_in_photos
-from arview.measurement.datums.options import DatumOptions
 from arview.measurement.folder import read_folder
 from arview.measurement.photo import load_views
 from arview.measurement.uncertainty.decision import decide
@@ -191,7 +190,7 @@ def repeatability_rows(photos: PhotoSet, out: Path) -> list[ResultRow]:
             observed_photo=np.searchsorted(kept, sparse.observed_photo[is_kept]).astype(np.int32),
             observed_px=sparse.observed_px[is_kept],
         )  # fmt: skip
-        equations = measure_datums_in_photos(part.datums, load_views(some, part.model), {}, DatumOptions())
+        equations = measure_datums_in_photos(part.datums, load_views(some, part.model), {})
         middle, size_mm = 0.5 * (low + high), 0.5 * float(np.linalg.norm(high - low))
         frames.append(align(equations, middle, size_mm).rough_from_datum)
     found = np.array(frames)

@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 
 from arview.cad import Part
 from arview.camera import Camera
-from arview.evaluation import Scene
 from arview.geometry import Array, apply
 from arview.overlay.ghost import Ghost, GhostView
 from arview.overlay.mesh import topology
 from arview.overlay.occluders import OccluderFinder
 from arview.video import Image
+from arview_lab.evaluation import Scene
 from rows import ResultRow, watched
 from suites.several import Half, bracket_half, plate_half
 

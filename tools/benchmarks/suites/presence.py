@@ -13,18 +13,6 @@ from numpy.typing import NDArray
 from arview.cad import Part, load_part
 from arview.cad.model import Model
 from arview.camera.read import load_camera
-from arview.evaluation import Scene, load_scene
-from arview.evaluation.semisynthetic import (
-    WALK_ROUND,
-    LookAlike,
-    SequenceOptions,
-    Variant,
-    look_alike_job,
-    make_sequence,
-    shape,
-    with_absent,
-)
-from arview.evaluation.semisynthetic.random_solids import random_solid
 from arview.geometry import Array
 from arview.guideviews import GuideViewSet
 from arview.guideviews.cache import cached_guide_views
@@ -34,6 +22,18 @@ from arview.pose import Pose, Presence
 from arview.rendering.renderers import ZBufferRenderer
 from arview.tracking import TrackingSession
 from arview.video.sources import open_source
+from arview_lab.evaluation import Scene, load_scene
+from arview_lab.semisynthetic import (
+    WALK_ROUND,
+    LookAlike,
+    SequenceOptions,
+    Variant,
+    look_alike_job,
+    make_sequence,
+    shape,
+    with_absent,
+)
+from arview_lab.semisynthetic.random_solids import random_solid
 from photos import background_photos
 from recordings import ROOT, SHARED, skip
 from rows import ResultRow, watched

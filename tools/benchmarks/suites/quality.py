@@ -9,15 +9,16 @@ from typing import Any
 import cv2
 import numpy as np
 
-from arview.evaluation import PoseMeter, Scene, SceneFrame, scene_guide_views
-from arview.evaluation.protocols import box_symmetries
-from arview.evaluation.run import COARSE, IN_VIEW
 from arview.geometry import Array, apply, exp_so3, rigid
 from arview.guideviews import GuideViewSet
 from arview.pose import Pose, TrackingState
 from arview.refinement.modalities.edge import smoothed
 from arview.tracking import Tracker, TrackingSession
+from arview.tracking.tracker_options import STAGES
 from arview.video import Image
+from arview_lab.evaluation import PoseMeter, Scene, SceneFrame, scene_guide_views
+from arview_lab.evaluation.protocols import box_symmetries
+from arview_lab.evaluation.run import COARSE, IN_VIEW
 from recordings import PHOTO_SEQUENCES
 from rows import ResultRow, watched
 from suites.real_conditions import RealConditionsSuite
@@ -169,7 +170,7 @@ class _PoseSampler:
         }
         for kind, start in starts.items():
             body = start @ part.model_from_body
-            refined = tracker.refiner.refine(image, smooth, body, tracker.options.stages[-2:], appearance)[0]
+            refined = tracker.refiner.refine(image, smooth, body, STAGES[-2:], appearance)[0]
             quality = tracker.refiner.evidence(image, smooth, refined, appearance).quality
             yield self._sampled(kind, refined @ part.body_from_model, truth, quality)
 

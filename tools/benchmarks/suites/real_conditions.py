@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Any
 
 from arview.detection import Detector
-from arview.evaluation import PoseError, PoseMeter, Scene, SceneFrame, SceneResult, evaluate_scene, load_scene
-from arview.evaluation.protocols import Tally, detect_in_frames, spread_frames, true_pose
-from arview.evaluation.semisynthetic import BOX_SHAPES, CONDITIONS, CURVED_SHAPES, conditions_job, make_sequence
 from arview.geometry import Array
 from arview.guideviews import GuideViewSet
 from arview.pose import TrackingState
+from arview_lab.evaluation import PoseError, PoseMeter, Scene, SceneFrame, SceneResult, evaluate_scene, load_scene
+from arview_lab.evaluation.protocols import Tally, detect_in_frames, spread_frames, true_pose
+from arview_lab.semisynthetic import BOX_SHAPES, CONDITIONS, CURVED_SHAPES, conditions_job, make_sequence
 from photos import background_photos
 from rows import ResultRow, watched
 from suites.detection import detection_text, full_sphere_views, shares, summed

@@ -16,10 +16,10 @@ import numpy as np
 import trimesh
 
 from arview.camera import Camera
-from arview.evaluation.clouds import score_cloud
 from arview.geometry import Array, apply, invert, rotation_angle_rad
 from arview.reconstruction.dense import read_ply
 from arview.reconstruction.scale.similarity import Similarity, fit_points
+from arview_lab.evaluation.clouds import score_cloud
 from recordings import PhotoSet
 from rows import ResultRow
 

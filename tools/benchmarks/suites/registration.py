@@ -9,13 +9,13 @@ from importlib.util import find_spec
 import numpy as np
 
 from arview.geometry import Array, apply
-from arview.measurement.cloud.icp import (
+from arview.measurement.cloud.registration import register_to_surface
+from arview_lab.cloud.icp import (
     IcpOptions,
     IcpTarget,
     register_clouds,
 )
-from arview.measurement.cloud.registration import register_to_surface
-from arview.measurement.studies.common import EXACT, post
+from arview_lab.studies.common import EXACT, post
 from recordings import skip
 
 REFERENCE, MEASURED = 240_965, 24_099

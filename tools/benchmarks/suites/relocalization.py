@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from arview.evaluation import PoseMeter, Scene
-from arview.evaluation.protocols import box_symmetries
-from arview.evaluation.run import COARSE, IN_VIEW
 from arview.pose import TrackingState
 from arview.tracking import SessionOptions, TrackingSession
+from arview_lab.evaluation import PoseMeter, Scene
+from arview_lab.evaluation.protocols import box_symmetries
+from arview_lab.evaluation.run import COARSE, IN_VIEW
 from rows import ResultRow, watched
 from suites.detection import BOXES, recorded_views
 

@@ -8,11 +8,11 @@ from typing import Any
 import cv2
 import numpy as np
 
-from arview.evaluation import Scene, SceneResult, evaluate_scene, scene_guide_views
-from arview.evaluation.bop import SceneFrame
 from arview.pose import TrackingState
 from arview.tracking import TrackingSession
 from arview.video import Image
+from arview_lab.evaluation import Scene, SceneResult, evaluate_scene, scene_guide_views
+from arview_lab.evaluation.bop import SceneFrame
 from rows import ResultRow, watched
 
 ACCEPTED = ((0.5, 0.0), (0.75, 0.0), (1.0, 0.0), (2.0, 0.0), (1.0, 0.6), (1.0, 1.2), (1.0, 2.0))

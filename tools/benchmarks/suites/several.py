@@ -16,7 +16,6 @@ from arview.annotation import annotate
 from arview.cad import Part, load_part
 from arview.camera import Camera
 from arview.camera.read import load_camera
-from arview.evaluation import Scene, scene_guide_views
 from arview.geometry import Array, apply
 from arview.guideviews import GuideViewSet
 from arview.guideviews.cache import cached_guide_views
@@ -26,6 +25,7 @@ from arview.pose import Pose
 from arview.tracking import TrackingSession
 from arview.tracking.several.sessions import SeveralSessions
 from arview.video import Image, VideoSink, open_source
+from arview_lab.evaluation import Scene, scene_guide_views
 from recordings import ROOT
 from rows import ResultRow
 

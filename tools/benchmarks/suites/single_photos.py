@@ -9,10 +9,10 @@ import numpy as np
 
 from arview.cad import Model, Symmetry
 from arview.detection import Detector
-from arview.evaluation import FrameResult, PoseMeter, Scene, SceneResult, scene_guide_views, summarise
-from arview.evaluation.run import COARSE
 from arview.pose import TrackingState
 from arview.tracking import TrackingSession
+from arview_lab.evaluation import FrameResult, PoseMeter, Scene, SceneResult, scene_guide_views, summarise
+from arview_lab.evaluation.run import COARSE
 from rows import ResultRow, timing, watched
 
 MAX_FAILURES = 1

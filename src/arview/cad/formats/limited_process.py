@@ -27,6 +27,12 @@ except (ImportError, ValueError, OSError):
 """
 
 
+WALL_FACTOR = 4.0
+"""Seconds of waiting for one of computing, on a machine that is shared."""
+OUTPUT_MB = 1000.0
+"""Largest file that it writes, MB."""
+
+
 @dataclass(frozen=True)
 class ProcessLimits:
     """Limits of a reading process: fixed shares, and shares that grow with the size of the file.
@@ -35,19 +41,15 @@ class ProcessLimits:
         cpu_s: seconds of computing.
         cpu_s_per_mb: further seconds for each megabyte.
         max_cpu_s: seconds at most.
-        wall_factor: seconds of waiting for one of computing, on a machine that is shared.
         memory_mb: address space, MB, of which the libraries take 400.
         memory_mb_per_mb: further address space for each megabyte.
-        output_mb: largest file that it writes, MB.
     """
 
     cpu_s: float = 5.0
     cpu_s_per_mb: float = 20.0
     max_cpu_s: float = 600.0
-    wall_factor: float = 4.0
     memory_mb: float = 1500.0
     memory_mb_per_mb: float = 100.0
-    output_mb: float = 1000.0
 
     def cpu_of(self, size_mb: float) -> float:
         """Seconds of computing for a file of that size."""
@@ -71,7 +73,7 @@ def run_limited(
         limits: see `ProcessLimits`.
     """
     cpu_s = limits.cpu_of(size_mb)
-    numbers = [cpu_s, 1e6 * limits.memory_of(size_mb), 1e6 * limits.output_mb]
+    numbers = [cpu_s, 1e6 * limits.memory_of(size_mb), 1e6 * OUTPUT_MB]
     # Without the limit each thread reserves an arena of address space, which counts as memory.
     environment = {**os.environ, "MALLOC_ARENA_MAX": "2", "OPENBLAS_NUM_THREADS": "1"}
     log = folder / "log.txt"
@@ -83,7 +85,7 @@ def run_limited(
                 stdout=output,
                 stderr=subprocess.STDOUT,
                 env=environment,
-                timeout=limits.wall_factor * cpu_s,
+                timeout=WALL_FACTOR * cpu_s,
             ).returncode
         except subprocess.TimeoutExpired:
             code = TIMED_OUT

@@ -189,7 +189,14 @@ def split_solids(data: bytes) -> bytes:
         for item in items:
             name = solids[item] if _plain_name(solids[item]) else product_name
             parts = _product_of_solid(
-                new_id, name, b"#" + item, origin, match[4], definition, shape, definition_context, product_context
+                new_id,
+                name,
+                b"#" + item,
+                origin=origin,
+                context=match[4],
+                parent=(definition, shape),
+                definition_context=definition_context,
+                product_context=product_context,
             )
             added += _statements(new_id, parts)
             new_id += len(parts)
@@ -204,12 +211,11 @@ def _product_of_solid(
     solid: bytes,
     origin: bytes,
     context: bytes,
-    parent: bytes,
-    parent_shape: bytes,
+    parent: tuple[bytes, bytes],
     definition_context: bytes,
     product_context: bytes,
 ) -> list[bytes]:
-    """Statements, numbered from ``first``, of a product of one solid and of its use in a parent product."""
+    """Statements, numbered from ``first``, of a product of one solid and of its use in a parent (definition, shape)."""
     n = first
     return [
         b"ADVANCED_BREP_SHAPE_REPRESENTATION(%s,(%s,%s),#%s)" % (name, origin, solid, context),
@@ -218,11 +224,11 @@ def _product_of_solid(
         b"PRODUCT_DEFINITION('','',#%d,#%s)" % (n + 2, definition_context),
         b"PRODUCT_DEFINITION_SHAPE('','',#%d)" % (n + 3),
         b"SHAPE_DEFINITION_REPRESENTATION(#%d,#%d)" % (n + 4, n),
-        b"NEXT_ASSEMBLY_USAGE_OCCURRENCE('%d',%s,'',#%s,#%d,$)" % (n, name, parent, n + 3),
+        b"NEXT_ASSEMBLY_USAGE_OCCURRENCE('%d',%s,'',#%s,#%d,$)" % (n, name, parent[0], n + 3),
         b"PRODUCT_DEFINITION_SHAPE('','',#%d)" % (n + 6),
         b"ITEM_DEFINED_TRANSFORMATION('','',%s,%s)" % (origin, origin),
         b"(REPRESENTATION_RELATIONSHIP('','',#%d,#%s)REPRESENTATION_RELATIONSHIP_WITH_TRANSFORMATION(#%d)"
-        b"SHAPE_REPRESENTATION_RELATIONSHIP())" % (n, parent_shape, n + 8),
+        b"SHAPE_REPRESENTATION_RELATIONSHIP())" % (n, parent[1], n + 8),
         b"CONTEXT_DEPENDENT_SHAPE_REPRESENTATION(#%d,#%d)" % (n + 9, n + 7),
     ]
 

@@ -9,8 +9,6 @@ Estimation", CVIU 1996, here with the median); images with little noise are retu
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -24,19 +22,12 @@ INPUT_MEAN, INPUT_SCALE = 128.0, 64.0
 """Grey level subtracted from the network's input, and the grey levels that input and output are divided by."""
 
 
-@dataclass(frozen=True)
-class DenoiserOptions:
-    """Options of the denoiser.
-
-    Attributes:
-        min_noise: noise level in grey levels below which images are returned as they are.
-        band_rows: height of the bands in which an image is denoised, which bounds the memory.
-        overlap_rows: rows added above and below a band; no smaller than the network's receptive field.
-    """
-
-    min_noise: float = 5.0
-    band_rows: int = 512
-    overlap_rows: int = 48
+MIN_NOISE = 5.0
+"""Noise level in grey levels below which images are returned as they are."""
+BAND_ROWS = 512
+"""Height of the bands in which an image is denoised, which bounds the memory."""
+OVERLAP_ROWS = 48
+"""Rows added above and below a band; no smaller than the network's receptive field."""
 
 
 def noise_level(image: NDArray[np.uint8], stride: int = 3) -> float:
@@ -62,20 +53,18 @@ def noise_level(image: NDArray[np.uint8], stride: int = 3) -> float:
 class Denoiser:
     """The denoising network; threads may share it."""
 
-    def __init__(self, options: DenoiserOptions | None = None) -> None:
-        self.options = options or DenoiserOptions()
+    def __init__(self) -> None:
         self._network = load_network("denoiser.onnx")
 
     def denoise(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """An RGB image (H,W,3) without its noise; the same array if there is little noise."""
-        o = self.options
-        if noise_level(image) < o.min_noise:
+        if noise_level(image) < MIN_NOISE:
             return image
         height, width = image.shape[:2]
         clean = np.empty_like(image)
-        for top in range(0, height, o.band_rows):
-            bottom = min(top + o.band_rows, height)
-            first, last = max(0, top - o.overlap_rows), min(height, bottom + o.overlap_rows)
+        for top in range(0, height, BAND_ROWS):
+            bottom = min(top + BAND_ROWS, height)
+            first, last = max(0, top - OVERLAP_ROWS), min(height, bottom + OVERLAP_ROWS)
             band = padded_to_multiple(image[first:last], CELL_PX)
             # OpenCV rounds and clips to 0–255.
             denoised = cv2.subtract(band, self._noise(band), dtype=cv2.CV_8U)

@@ -9,8 +9,6 @@ photos, see ``tools/training/fit.py``.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -35,26 +33,18 @@ INPUT_SCALE = 64.0
 """Grey levels that the input is divided by after its mean is subtracted."""
 
 
-@dataclass(frozen=True)
-class EdgeNetOptions:
-    """Local normalisation of the edge responses.
-
-    Attributes:
-        neighbourhood_px: side of the square of map pixels over which the strongest response is taken and smoothed.
-        reference_share: share of the strongest response nearby that becomes a full response.
-        min_reference: lower bound on that reference, so that weak responses to clutter stay weak.
-    """
-
-    neighbourhood_px: int = 49
-    reference_share: float = 0.9
-    min_reference: float = 0.15
+NEIGHBOURHOOD_PX = 49
+"""Side of the square of map pixels over which the strongest response is taken and smoothed."""
+REFERENCE_SHARE = 0.9
+"""Share of the strongest response nearby that becomes a full response."""
+MIN_REFERENCE = 0.15
+"""Lower bound on that reference, so that weak responses to clutter stay weak."""
 
 
 class EdgeNet:
     """The edge network; threads may share it."""
 
-    def __init__(self, options: EdgeNetOptions | None = None) -> None:
-        self.options = options or EdgeNetOptions()
+    def __init__(self) -> None:
         self._network = load_network("edge_net.onnx")
 
     def predict(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -67,7 +57,6 @@ class EdgeNet:
             (9,h,w) 0–255: `ORIENTATIONS` edge maps and `SOLID_CHANNEL`, at half the size of the image after its longer
             side is reduced to `MAX_SIDE_PX`.
         """
-        o = self.options
         height, width = image.shape[:2]
         share = min(1.0, MAX_SIDE_PX / max(height, width))
         if share < 1.0:
@@ -78,9 +67,9 @@ class EdgeNet:
         predicted = self._network(picture=cv2.dnn.blobFromImage(image, 1.0 / INPUT_SCALE, mean=(mean, mean, mean)))
         maps = predicted[0, :, : -(-height // SHRINK), : -(-width // SHRINK)]
         edges = maps[:SOLID_CHANNEL]
-        side = o.neighbourhood_px
+        side = NEIGHBOURHOOD_PX
         strongest = cv2.dilate(edges.max(axis=0), np.ones((side, side), dtype=np.uint8))
-        reference = np.maximum(o.reference_share * cv2.blur(strongest, (side // 2, side // 2)), o.min_reference)
+        reference = np.maximum(REFERENCE_SHARE * cv2.blur(strongest, (side // 2, side // 2)), MIN_REFERENCE)
         np.minimum(edges / reference, 1.0, out=edges)
         return np.asarray(np.round(255.0 * maps).astype(np.uint8))
 
@@ -112,9 +101,12 @@ def resize_responses(maps: NDArray[np.uint8], width: int, height: int, spread_px
 
 @kernel
 def mean_edge_response(
-    maps: NDArray[np.uint8], part: ViewArrays, pose: NDArray[np.float64], intrinsics: NDArray[np.float64],
-    step_mm: float
-) -> float:  # fmt: skip
+    maps: NDArray[np.uint8],
+    part: ViewArrays,
+    pose: NDArray[np.float64],
+    intrinsics: NDArray[np.float64],
+    step_mm: float,
+) -> float:
     """Mean edge response 0–1 under the outline and the design edges of a part, which weigh at most half.
 
     Args:

@@ -64,7 +64,7 @@ def colour_gradients(image: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], Chann
 @kernel
 def _strongest(
     gx: NDArray[np.int16], gy: NDArray[np.int16]
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:  # fmt: skip
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
     """Gradient (H,W) of each pixel's strongest channel (Dalal & Triggs, CVPR 2005), and its size in grey levels."""
     channels, height, width = gx.shape
     x = np.empty((height, width), dtype=np.float32)
@@ -90,9 +90,12 @@ def _strongest(
 
 @kernel
 def _oriented(
-    phase: NDArray[np.float32], magnitude: NDArray[np.float32], around: NDArray[np.float32],
-    peak: NDArray[np.float32], pool: int
-) -> NDArray[np.uint8]:  # fmt: skip
+    phase: NDArray[np.float32],
+    magnitude: NDArray[np.float32],
+    around: NDArray[np.float32],
+    peak: NDArray[np.float32],
+    pool: int,
+) -> NDArray[np.uint8]:
     """Strength of thin edges by orientation (8, H / pool, W / pool), relative to the contrast around them.
 
     An edge between two orientations counts for both.
@@ -166,9 +169,15 @@ def orientation_bins(normals_px: Array) -> NDArray[np.uint8]:
 
 @kernel
 def collect_points(
-    part: ViewArrays, view: int, pose: NDArray[np.float64], intrinsics: NDArray[np.float64], step_mm: float,
-    contour_count: int, edge_count: int, points: NDArray[np.int64]
-) -> int:  # fmt: skip
+    part: ViewArrays,
+    view: int,
+    pose: NDArray[np.float64],
+    intrinsics: NDArray[np.float64],
+    step_mm: float,
+    contour_count: int,
+    edge_count: int,
+    points: NDArray[np.int64],
+) -> int:
     """Project a guide view's outline and design edges, and return the number of points.
 
     ``points`` (3,N) int64 receives their columns, rows and orientation bins; see `score_around` for the rest.
@@ -180,17 +189,25 @@ def collect_points(
             stride = max(1, (last - first) // contour_count)
             limit = contour_count + 32
             px, normals, depths = project_lines(
-                part.contour_points[first:last:stride], part.contour_normals[first:last:stride], False, pose,
-                intrinsics, step_mm,
-            )  # fmt: skip
+                part.contour_points[first:last:stride],
+                part.contour_normals[first:last:stride],
+                False,
+                pose,
+                intrinsics,
+                step_mm,
+            )
         else:
             first, last = part.edge_starts[view], part.edge_starts[view + 1]
             stride = max(1, (last - first) // (2 * edge_count))
             limit = points.shape[1]
             px, normals, depths = project_lines(
-                part.edge_points[first:last:stride], part.edge_tangents[first:last:stride], True, pose, intrinsics,
+                part.edge_points[first:last:stride],
+                part.edge_tangents[first:last:stride],
+                True,
+                pose,
+                intrinsics,
                 step_mm,
-            )  # fmt: skip
+            )
         for i in range(px.shape[0]):
             if group == 1:
                 kind = part.edge_kinds[first + i * stride]
@@ -208,10 +225,18 @@ def collect_points(
 
 @kernel
 def score_around(
-    maps: NDArray[np.uint8], part: ViewArrays, cam_from_body: NDArray[np.float64], intrinsics: NDArray[np.float64],
-    step_mm: float, turns: NDArray[np.float64], stretches: NDArray[np.float64], shift_px: int, shift_step: int,
-    contour_count: int, edge_count: int
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:  # fmt: skip
+    maps: NDArray[np.uint8],
+    part: ViewArrays,
+    cam_from_body: NDArray[np.float64],
+    intrinsics: NDArray[np.float64],
+    step_mm: float,
+    turns: NDArray[np.float64],
+    stretches: NDArray[np.float64],
+    shift_px: int,
+    shift_step: int,
+    contour_count: int,
+    edge_count: int,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Score poses around one pose by the responses under their projected outline and design edges.
 
     Args:
@@ -249,7 +274,16 @@ def score_around(
             for i in range(3):
                 pose[i, 3] = cam_from_body[i, 3] * stretches[d]
             poses[index] = pose
-            count = collect_points(part, view, pose, intrinsics, step_mm, contour_count, edge_count, points)
+            count = collect_points(
+                part,
+                view,
+                pose,
+                intrinsics=intrinsics,
+                step_mm=step_mm,
+                contour_count=contour_count,
+                edge_count=edge_count,
+                points=points,
+            )
             if count < 16:
                 continue
             best, best_dx, best_dy = best_shift(maps, points, count, shift_px, shift_step, sums)
@@ -261,9 +295,13 @@ def score_around(
 
 @kernel
 def best_shift(
-    maps: NDArray[np.uint8], points: NDArray[np.int64], count: int, shift_px: int, shift_step: int,
-    sums: NDArray[np.int32]
-) -> tuple[int, int, int]:  # fmt: skip
+    maps: NDArray[np.uint8],
+    points: NDArray[np.int64],
+    count: int,
+    shift_px: int,
+    shift_step: int,
+    sums: NDArray[np.int32],
+) -> tuple[int, int, int]:
     """Highest sum of responses under the first ``count`` points over all shifts, and that shift dx, dy in px.
 
     ``points`` is as `collect_points` fills it; ``sums`` (S,S) int32 is a work buffer. Points that a shift moves outside

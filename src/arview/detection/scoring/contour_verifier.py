@@ -89,17 +89,27 @@ def contour_profiles(pyramid: ImagePyramid, part: PartView, pose: Array) -> NDAr
     level = pyramid.level(profile_step(pyramid, radius_px))
     profiles = np.zeros((RAW_CHANNELS, ROWS, COLUMNS), dtype=np.uint8)
     _sample_profiles(
-        level.colours, level.edge_responses, part.arrays, pose, level.intrinsics, 0.01 * part.views.diameter_mm,
+        level.colours,
+        level.edge_responses,
+        part.arrays,
+        pose,
+        level.intrinsics,
+        0.01 * part.views.diameter_mm,
         profiles,
-    )  # fmt: skip
+    )
     return profiles
 
 
 @kernel(fastmath=True)
 def _sample_profiles(
-    colours: NDArray[np.uint8], responses: NDArray[np.uint8], part: ViewArrays, pose: NDArray[np.float64],
-    intrinsics: NDArray[np.float64], step_mm: float, profiles: NDArray[np.uint8]
-) -> None:  # fmt: skip
+    colours: NDArray[np.uint8],
+    responses: NDArray[np.uint8],
+    part: ViewArrays,
+    pose: NDArray[np.float64],
+    intrinsics: NDArray[np.float64],
+    step_mm: float,
+    profiles: NDArray[np.uint8],
+) -> None:
     """Write the samples of `contour_profiles`."""
     height, width = colours.shape[:2]
     rows, columns = responses.shape[1:]
@@ -107,9 +117,13 @@ def _sample_profiles(
     points, directions, runs, outline, inner, _ = sample_lines(part, pose, OUTLINE_ROWS, INNER_ROWS)
     px, normals, depths = project_lines(points[:outline], directions[:outline], False, pose, intrinsics, step_mm)
     inner_px, inner_normals, inner_depths = project_lines(
-        points[OUTLINE_ROWS : OUTLINE_ROWS + inner], directions[OUTLINE_ROWS : OUTLINE_ROWS + inner], True, pose,
-        intrinsics, step_mm,
-    )  # fmt: skip
+        points[OUTLINE_ROWS : OUTLINE_ROWS + inner],
+        directions[OUTLINE_ROWS : OUTLINE_ROWS + inner],
+        True,
+        pose,
+        intrinsics,
+        step_mm,
+    )
     half = COLUMNS // 2
     for i in range(outline + inner):
         is_inner = i >= outline

@@ -162,9 +162,8 @@ def append_edge_responses(channels: NDArray[np.float32], responses: NDArray[np.u
 
 @kernel
 def crop_edge_responses(
-    responses: NDArray[np.uint8], shrunk: float, zoom: float, shift: NDArray[np.float64],
-    outline: NDArray[np.float32]
-) -> NDArray[np.uint8]:  # fmt: skip
+    responses: NDArray[np.uint8], shrunk: float, zoom: float, shift: NDArray[np.float64], outline: NDArray[np.float32]
+) -> NDArray[np.uint8]:
     """Edge responses around a pose (RESPONSE_CHANNELS,S,S) uint8.
 
     Args:
@@ -335,9 +334,14 @@ def _slope_at(plane: NDArray[np.float32], v: int, u: int, slope: NDArray[np.floa
 
 @kernel(fastmath=True)
 def draw_edges(
-    part: ViewArrays, pose: NDArray[np.float64], intrinsics: NDArray[np.float64], step_mm: float, zoom: float,
-    shift: NDArray[np.float64], drawn: NDArray[np.float32]
-) -> None:  # fmt: skip
+    part: ViewArrays,
+    pose: NDArray[np.float64],
+    intrinsics: NDArray[np.float64],
+    step_mm: float,
+    zoom: float,
+    shift: NDArray[np.float64],
+    drawn: NDArray[np.float32],
+) -> None:
     """Draw the outline and the design edges of the part at a pose.
 
     Args:

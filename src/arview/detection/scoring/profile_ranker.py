@@ -139,10 +139,14 @@ class ProfileRanker:
             name, step, some = batch
             return np.asarray(
                 score_profiles(
-                    pyramid.level(step), part.resolvable, poses[some], np.log(view_lines[some]), part.views.diameter_mm,
+                    pyramid.level(step),
+                    part.resolvable,
+                    poses[some],
+                    np.log(view_lines[some]),
+                    part.views.diameter_mm,
                     ranker_layers(name),
                 )
-            )  # fmt: skip
+            )
 
         total = np.zeros(len(poses))
         for (_, _, some), scores in zip(batches, pool().map(score, batches), strict=True):
@@ -159,9 +163,14 @@ def describe_poses(
     for step, some in _batches(pyramid, part, poses, radius_px):
         for k in some:
             describe_profiles(
-                pyramid.level(step), part.resolvable, poses[k], np.log(view_lines[k]), part.views.diameter_mm,
-                profiles[k], scalars[k],
-            )  # fmt: skip
+                pyramid.level(step),
+                part.resolvable,
+                poses[k],
+                np.log(view_lines[k]),
+                part.views.diameter_mm,
+                profiles[k],
+                scalars[k],
+            )
     return profiles, scalars
 
 
@@ -178,9 +187,13 @@ def _batches(
 
 @kernel(fastmath=True)
 def score_profiles(
-    level: PyramidLevel, part: ViewArrays, poses: NDArray[np.float64], log_lines: NDArray[np.float64],
-    diameter_mm: float, layers: RankerLayers
-) -> NDArray[np.float64]:  # fmt: skip
+    level: PyramidLevel,
+    part: ViewArrays,
+    poses: NDArray[np.float64],
+    log_lines: NDArray[np.float64],
+    diameter_mm: float,
+    layers: RankerLayers,
+) -> NDArray[np.float64]:
     """Scores (N,) of poses; see `ProfileRanker.scores`.
 
     Args:
@@ -228,9 +241,14 @@ def score_profiles(
 
 @kernel(fastmath=True)
 def describe_profiles(
-    level: PyramidLevel, part: ViewArrays, pose: NDArray[np.float64], log_lines: float, diameter_mm: float,
-    profiles: NDArray[np.float32], scalars: NDArray[np.float32]
-) -> None:  # fmt: skip
+    level: PyramidLevel,
+    part: ViewArrays,
+    pose: NDArray[np.float64],
+    log_lines: float,
+    diameter_mm: float,
+    profiles: NDArray[np.float32],
+    scalars: NDArray[np.float32],
+) -> None:
     """Write the features of a pose to ``profiles`` (L, FEATURES) and ``scalars`` (RANKER_SCALARS,), float32.
 
     Profiles outside the image are all zero.
@@ -336,7 +354,7 @@ def _sample_profiles(
 @kernel(fastmath=True)
 def _compare_sides(
     sides: NDArray[np.float64], mean_colour: NDArray[np.float64], step: float, profiles: NDArray[np.float32]
-) -> None:  # fmt: skip
+) -> None:
     """Make gradients relative to their mean ``step``, and write the colour differences; see `_sample_profiles`."""
     for slot in range(profiles.shape[0]):
         line = profiles[slot]

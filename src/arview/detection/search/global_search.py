@@ -9,7 +9,7 @@ This keeps search in clutter affordable on a CPU. A profile ranker orders what r
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, fields, replace
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -28,7 +28,6 @@ from arview.detection.search.nms import select_distinct
 from arview.detection.search.pattern_search import search_outlines
 from arview.detection.search.template_bank import (
     GROUPS,
-    OutlineOptions,
     in_fundamental_domain,
     make_bank,
     make_outlines,
@@ -57,6 +56,46 @@ class RefinementStep:
     is_fine: bool
 
 
+GRID_PX = 4
+"""Spacing of the places at which templates are matched."""
+MAX_SCALE = 1.5
+"""Largest factor by which the image is enlarged for near distances."""
+MIN_SCORE = 0.3
+"""Mean response below which template matches are noise."""
+CELL_PX = 4.0
+CELL_ROLL_RAD = 0.33
+"""Size in place and roll of the cells of which only the best match is kept."""
+MATCHES_PER_KEPT = 5
+"""Matches gathered per match kept after duplicates are removed."""
+STEPS: tuple[RefinementStep, ...] = (
+    RefinementStep(scale_steps=2, roll_step_rad=0.16, stretch_step=0.07, is_fine=False),
+    RefinementStep(scale_steps=2, roll_step_rad=0.16, stretch_step=0.07, is_fine=False),
+    RefinementStep(scale_steps=2, roll_step_rad=0.08, stretch_step=0.04, is_fine=True),
+)
+"""Rounds of improvement, from half diameters of 20 px over 28 and 40 to 57 px."""
+ROUNDS = 2
+"""Maximum number of passes over all changes of view, roll and size in one round of improvement."""
+SHIFT_PX = 2
+"""Range and step of the shifts tried with each change."""
+DISTINCT_PX = 6.0
+DISTINCT_RAD = 0.15
+DISTINCT_RATIO = 1.06
+"""Offset at the scale of the templates, rotation and distance ratio within which improved matches are duplicates."""
+RESPONSE_WEIGHT = 20.0
+"""Weight of the mean response beside the profile score when candidates are ranked."""
+MAX_OCTAVES = 2.6
+"""A wider range of sizes is searched in two parts, so that the usual sizes take no longer."""
+CORE_FILL = (0.18, 0.85)
+"""The part's diameter in the picture, as shares of its longer side, in the first of these parts."""
+CUT_FILL = 0.7
+"""The part's diameter, as a share of the picture's shorter side, from which it is also searched where the picture's
+border cuts it."""
+CUT_MARGIN = 0.4
+"""Distance that its templates may reach out of the response maps, as a share of ``radius_px``."""
+MIN_MAP_PX = 16
+"""Side of a response map, without its border, below which nothing is searched."""
+
+
 @dataclass(frozen=True)
 class GlobalSearchOptions:
     """Options of the global search.
@@ -65,52 +104,11 @@ class GlobalSearchOptions:
         radius_px: half the part's diameter in the templates.
         roll_step_deg: spacing of the templates in roll.
         subdivisions: icosahedron level of the template directions (2: 162, about 17° apart).
-        outlines: see `OutlineOptions`.
-        grid_px: spacing of the places at which templates are matched.
-        max_scale: largest factor by which the image is enlarged for near distances.
-        min_score: mean response below which template matches are noise.
-        cell_px, cell_roll_rad: size in place and roll of the cells of which only the best match is kept.
-        matches_per_kept: matches gathered per match kept after duplicates are removed.
-        steps: rounds of improvement, from half diameters of 20 px over 28 and 40 to 57 px.
-        rounds: maximum number of passes over all changes of view, roll and size in one round of improvement.
-        shift_px: range and step of the shifts tried with each change.
-        distinct_px, distinct_rad, distinct_ratio: offset at the scale of the templates, rotation and distance ratio
-            within which improved matches are duplicates.
-        response_weight: weight of the mean response beside the profile score when candidates are ranked.
-        max_octaves: a wider range of sizes is searched in two parts, so that the usual sizes take no longer.
-        core_fill: the part's diameter in the picture, as shares of its longer side, in the first of these parts.
-        cut_fill: the part's diameter, as a share of the picture's shorter side, from which it is also searched where
-            the picture's border cuts it.
-        cut_margin: distance that its templates may reach out of the response maps, as a share of ``radius_px``.
-        min_map_px: side of a response map, without its border, below which nothing is searched.
     """
 
     radius_px: float = 20.0
     roll_step_deg: float = 18.0
     subdivisions: int = 2
-    outlines: OutlineOptions = field(default_factory=OutlineOptions)
-    grid_px: int = 4
-    max_scale: float = 1.5
-    min_score: float = 0.3
-    cell_px: float = 4.0
-    cell_roll_rad: float = 0.33
-    matches_per_kept: int = 5
-    steps: tuple[RefinementStep, ...] = (
-        RefinementStep(scale_steps=2, roll_step_rad=0.16, stretch_step=0.07, is_fine=False),
-        RefinementStep(scale_steps=2, roll_step_rad=0.16, stretch_step=0.07, is_fine=False),
-        RefinementStep(scale_steps=2, roll_step_rad=0.08, stretch_step=0.04, is_fine=True),
-    )
-    rounds: int = 2
-    shift_px: int = 2
-    distinct_px: float = 6.0
-    distinct_rad: float = 0.15
-    distinct_ratio: float = 1.06
-    response_weight: float = 20.0
-    max_octaves: float = 2.6
-    core_fill: tuple[float, float] = (0.18, 0.85)
-    cut_fill: float = 0.7
-    cut_margin: float = 0.4
-    min_map_px: int = 16
 
 
 @dataclass(frozen=True)
@@ -126,7 +124,7 @@ class SearchBudget:
         scale_stride: spacing of the scale steps at which templates are matched.
         is_trimmed: leave out the quarter of each outline with the lowest responses, which may be occluded.
         use_edge_net: edge responses weigh as much as gradients until poses are ranked.
-        is_outer: search a wide range's outer sizes, see `GlobalSearchOptions.core_fill`, and nothing in other ranges.
+        is_outer: search a wide range's outer sizes, see `CORE_FILL`, and nothing in other ranges.
     """
 
     matches: int
@@ -270,12 +268,12 @@ class GlobalSearch:
         self._diameter_mm = views.diameter_mm
         self._focal_px = 0.5 * (camera.fx + camera.fy)
         self._ranker = ProfileRanker(part)
-        self.outlines = make_outlines(views, part.model_from_body, o.outlines)
+        self.outlines = make_outlines(views, part.model_from_body)
         # Scale steps of the templates, from far to near: large images first.
         low, high = views.view_range.for_camera(camera, views.diameter_mm).distance_mm
         self._distances_mm = search_distances_mm(views, camera)
         near, far = self.step_at(low), self.step_at(high)
-        top = int(np.floor(STEPS_PER_OCTAVE * np.log2(o.max_scale)))
+        top = int(np.floor(STEPS_PER_OCTAVE * np.log2(MAX_SCALE)))
         self._steps = [s for s in range(int(np.floor(far + 0.4)), int(np.ceil(near - 0.4)) - 1, -1) if s <= top]
         self._core, self._outer = self._split(self._steps)
         chosen = outlines_near_icosphere(views, self.outlines, o.subdivisions)
@@ -296,10 +294,10 @@ class GlobalSearch:
     def _split(self, steps: list[int]) -> tuple[list[int], list[int]]:
         """Scale steps of the usual sizes, and of all others where the range of sizes is wide."""
         o = self.options
-        if len(steps) <= o.max_octaves * STEPS_PER_OCTAVE:
+        if len(steps) <= MAX_OCTAVES * STEPS_PER_OCTAVE:
             return steps, []
         longer_px = max(self.camera.width, self.camera.height)
-        last, first = (step_for(0.5 * fill * longer_px, o.radius_px) for fill in o.core_fill)
+        last, first = (step_for(0.5 * fill * longer_px, o.radius_px) for fill in CORE_FILL)
         core = [step for step in steps if round(first) <= step <= round(last)]
         return core, [step for step in steps if step not in core]
 
@@ -320,7 +318,7 @@ class GlobalSearch:
     ) -> list[PoseCandidate]:
         """The candidates with the highest profile scores and responses, best first."""
         scores = self._ranker.scores(pyramid, candidates.poses, candidates.view_lines)
-        scores = scores + self.options.response_weight * candidates.responses
+        scores = scores + RESPONSE_WEIGHT * candidates.responses
         best = np.argsort(-scores, kind="stable")[: budget.starts]
         return [PoseCandidate(float(scores[k]), candidates.poses[k]) for k in best]
 
@@ -331,7 +329,7 @@ class GlobalSearch:
         matches = self._match_all(pyramid, budget)
         if not len(matches.keys):
             return NO_CANDIDATES
-        *first_steps, last_step = self.options.steps
+        *first_steps, last_step = STEPS
         for step in first_steps:
             matches = self._refine(pyramid, matches, step, budget.is_trimmed)
         matches = self._refine(pyramid, matches.best(budget.refined), last_step, budget.is_trimmed)
@@ -344,7 +342,6 @@ class GlobalSearch:
 
     def _match_all(self, pyramid: ImagePyramid, budget: SearchBudget) -> TemplateMatches:
         """The best template matches at all scales, without duplicates."""
-        o = self.options
         steps = self._outer if budget.is_outer else self._core
         if not steps:
             return self._no_matches()
@@ -355,7 +352,7 @@ class GlobalSearch:
         halves = [0, count // 2, count]
         votes = {step: np.zeros((GROUPS, 1024), dtype=np.int64) for step in scales}
         # Every group of views keeps equally many at each scale; most of them are duplicates.
-        kept = o.matches_per_kept * -(-budget.matches // (self._groups * len(scales)))
+        kept = MATCHES_PER_KEPT * -(-budget.matches // (self._groups * len(scales)))
         levels = list(zip(scales, phases, strict=True))
         jobs = [(*level, first, last) for level in levels for first, last in pairwise(halves)]
         found = pool().map(lambda job: self._match(votes[job[0]], kept, budget.is_trimmed, pyramid, *job), jobs)
@@ -366,20 +363,20 @@ class GlobalSearch:
         o = self.options
         if o.radius_px < self._min_cut_px(step):
             return 0
-        return o.grid_px * math.ceil(o.cut_margin * o.radius_px / o.grid_px)
+        return GRID_PX * math.ceil(CUT_MARGIN * o.radius_px / GRID_PX)
 
     def _min_cut_px(self, step: int) -> float:
         """Half diameter at a scale step from which the part is searched where the picture's border cuts it."""
         shorter_px = min(self.camera.width, self.camera.height) * 2.0 ** (step / STEPS_PER_OCTAVE)
-        return 0.5 * self.options.cut_fill * shorter_px
+        return 0.5 * CUT_FILL * shorter_px
 
     def _phases(self, pyramid: ImagePyramid, step: int) -> NDArray[np.uint8]:
         """The decimated response maps at a scale step."""
         maps, _ = pyramid.maps(step)
         margin_px = self._cut_margin_px(step)
         if margin_px == 0:
-            return decimate(maps, self.options.grid_px)
-        return decimate_with_border(maps, self.options.grid_px, pyramid.pad_px, margin_px)
+            return decimate(maps, GRID_PX)
+        return decimate_with_border(maps, GRID_PX, pyramid.pad_px, margin_px)
 
     @staticmethod
     def _no_matches() -> TemplateMatches:
@@ -400,10 +397,10 @@ class GlobalSearch:
         """The matches of the templates ``first`` to ``last`` at one scale."""
         bank = self.banks[step]
         maps, _ = pyramid.maps(step)
-        if min(maps.shape[1:]) < self.options.min_map_px + 2 * pyramid.pad_px:
+        if min(maps.shape[1:]) < MIN_MAP_PX + 2 * pyramid.pad_px:
             return self._no_matches()
         keys, templates, places = match_templates(
-            phases, bank.offsets, bank.bins, bank.gains, bank.groups, first, last, kept, self.options.min_score, votes,
+            phases, bank.offsets, bank.bins, bank.gains, bank.groups, first, last, kept, MIN_SCORE, votes,
             is_trimmed,
         )  # fmt: skip
         return TemplateMatches(
@@ -437,10 +434,10 @@ class GlobalSearch:
         matches = matches.select(np.argsort(-matches.keys, kind="stable"))
         rotations, positions = self._posed(matches)
         # In pixels at the scale of the templates: the larger the part is in the image, the larger the offset.
-        reach = np.full(len(positions), o.distinct_px / o.radius_px) * 0.5 * self._diameter_mm
-        cosine = np.cos(o.distinct_rad)
+        reach = np.full(len(positions), DISTINCT_PX / o.radius_px) * 0.5 * self._diameter_mm
+        cosine = np.cos(DISTINCT_RAD)
         return matches.select(
-            select_distinct(rotations, positions, reach / positions[:, 2], cosine, o.distinct_ratio, count)
+            select_distinct(rotations, positions, reach / positions[:, 2], cosine, DISTINCT_RATIO, count)
         )
 
     def _without_duplicates(self, matches: TemplateMatches, count: int) -> TemplateMatches:
@@ -448,10 +445,9 @@ class GlobalSearch:
 
         The best of each group of views at each scale come first, then all second best, and so on.
         """
-        o = self.options
         matches = matches.best(len(matches.keys))
-        cells = np.floor(matches.places / o.cell_px).astype(np.int64) + 4096
-        rolls = np.floor(matches.rolls / o.cell_roll_rad).astype(np.int64) + 64
+        cells = np.floor(matches.places / CELL_PX).astype(np.int64) + 4096
+        rolls = np.floor(matches.rolls / CELL_ROLL_RAD).astype(np.int64) + 64
         groups = self.outlines.groups[matches.views].astype(np.int64) * 128 + matches.steps + 64
         _, first = np.unique(((groups * 8192 + cells[:, 0]) * 8192 + cells[:, 1]) * 128 + rolls, return_index=True)
         first.sort()
@@ -467,7 +463,7 @@ class GlobalSearch:
         """Matches improved independently on larger maps, without those that leave the searched distances."""
         if not len(matches.keys):
             return matches
-        o, outlines = self.options, self.outlines
+        outlines = self.outlines
         around = outlines.near if refinement.is_fine else outlines.far
         jobs = []
         for step in np.unique(matches.steps):
@@ -484,8 +480,8 @@ class GlobalSearch:
             places = (some.places + 0.5) * scale[:, None] - 0.5 + pyramid.pad_px
             scores, views, rolls, radii_px, places = search_outlines(
                 maps, outlines.points, outlines.angles, around.views, around.rolls, some.views, some.rolls,
-                some.radii_px * scale, places, focal_px, refinement.roll_step_rad, refinement.stretch_step, o.rounds,
-                o.shift_px, o.shift_px, is_trimmed, pyramid.pad_px, self._min_cut_px(step), _typical_response(maps),
+                some.radii_px * scale, places, focal_px, refinement.roll_step_rad, refinement.stretch_step, ROUNDS,
+                SHIFT_PX, SHIFT_PX, is_trimmed, pyramid.pad_px, self._min_cut_px(step), _typical_response(maps),
             )  # fmt: skip
             keys = weight_by_lines(scores, outlines.view_lines[views])
             steps = np.full(len(keys), step)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -29,7 +29,7 @@ from arview.detection.search.global_search import QUICK, PoseCandidate, weight_b
 from arview.detection.search.hypothesis import Hypothesis
 from arview.detection.search.nms import select_distinct
 from arview.detection.search.pattern_search import search_poses
-from arview.detection.search.polish import PolishOptions, polish
+from arview.detection.search.polish import polish
 from arview.detection.search.template_bank import ViewLineCounts
 from arview.geometry import Array, are_near, exp_so3, rigid
 from arview.guideviews import GuideViewSet
@@ -76,6 +76,56 @@ class PatternSearchLevel:
     points: int
 
 
+PAD_SHARE = 0.6
+"""Border of the response maps as a share of ``radius_px``."""
+RESPONSE_WEIGHT = 12.0
+"""Weight of the mean response after a level of the pattern search beside the profile score."""
+PREVIOUS_WEIGHT = 0.5
+"""Weight of a candidate's score before the level; a wrong pose seldom fits at several levels."""
+MAX_COARSE = 16
+"""Results of the pattern search that are refined through the coarse schedules."""
+COARSE_SCHEDULES: tuple[Schedule, ...] = (COARSE_STAGES, COARSE_COLOUR_STAGES)
+"""Schedules tried from each of these."""
+MAX_FINE = 5
+"""Hypotheses that are refined to the end."""
+MAX_COMPETITORS = 3
+"""Further hypotheses for clearly different poses that are refined to the end; the margin over them tells whether the
+best one stands out."""
+FINE_SCHEDULES: tuple[Schedule, ...] = (SEARCH_STAGES, NEAR_STAGES)
+"""Schedules tried from each of these: with edges and colours, and with nearby edges alone, because occluders shift the
+colour statistics."""
+SHADING_STAGES: Schedule = SEARCH_STAGES[-1:]
+"""Stages before the shading is used."""
+COARSE_TOLERANCE_PX = 3.5
+FINE_TOLERANCE_PX = 1.5
+"""Reach of the evidence after coarse and fine schedules."""
+COARSE_DISTINCT_DEG = 3.0
+DISTINCT_DEG = 5.0
+"""Rotation within which hypotheses are duplicates after coarse and fine schedules; hundredths of it are diameters."""
+COMPETITOR_DEG = 25.0
+COMPETITOR_DISTINCT_DEG = 15.0
+"""Rotation from the best pose, and from each other, of the competitors."""
+MIN_SCORE = 0.35
+"""Evidence score of the best pose below which no poses around it are tried."""
+NEIGHBOURHOOD_RAD = 0.05
+"""Rotation of the poses that are tried around it."""
+MAX_SHADING_LOSS = 3.0
+"""Largest drop in log odds accepted from the shading refinement."""
+MIN_IN_IMAGE = 0.4
+"""Share of the outline inside the image below which poses are dropped."""
+MAX_SCALE = 0.8
+"""Images are reduced as a whole, for all distances, by this factor or more or not at all."""
+MAX_SIDE_PX = 1280
+"""Longer side of an image above which it is reduced whatever the distances."""
+SIDE_UNIT_PX = 8
+"""Sides of reduced images are multiples of this, so that they can be halved."""
+SCALE = WorkingScaleOptions(radius_px=120.0, max_enlargement=1.0)
+"""Of the images in which poses are refined and measured, by the size of the part."""
+OUTLINE_SCALE = WorkingScaleOptions(radius_px=64.0, max_enlargement=1.0)
+"""Of the images in which the outline alone is judged: smaller, so that what differs between part and CAD by less than
+some hundredths of the diameter does not count."""
+
+
 @dataclass(frozen=True)
 class LocalSearchOptions:
     """Options of the local search.
@@ -83,34 +133,8 @@ class LocalSearchOptions:
     Attributes:
         radius_px: half the part's diameter in images of magnification 1.
         levels: of the pattern search.
-        pad_share: border of the response maps as a share of ``radius_px``.
-        response_weight: weight of the mean response after a level of the pattern search beside the profile score.
-        previous_weight: weight of a candidate's score before the level; a wrong pose seldom fits at several levels.
-        max_coarse: results of the pattern search that are refined through the coarse schedules.
-        coarse_schedules: schedules tried from each of these.
-        max_fine: hypotheses that are refined to the end.
-        max_competitors: further hypotheses for clearly different poses that are refined to the end; the margin over
-            them tells whether the best one stands out.
-        fine_schedules: schedules tried from each of these: with edges and colours, and with nearby edges alone, because
-            occluders shift the colour statistics.
         use_shading: refine curved parts by shading before they are verified.
-        shading_stages: stages before the shading is used.
         max_verified: refined poses that are verified.
-        coarse_tolerance_px, fine_tolerance_px: reach of the evidence after coarse and fine schedules.
-        coarse_distinct_deg, distinct_deg: rotation within which hypotheses are duplicates after coarse and fine
-            schedules; hundredths of it are diameters.
-        competitor_deg, competitor_distinct_deg: rotation from the best pose, and from each other, of the competitors.
-        min_score: evidence score of the best pose below which no poses around it are tried.
-        neighbourhood_rad: rotation of the poses that are tried around it.
-        max_shading_loss: largest drop in log odds accepted from the shading refinement.
-        min_in_image: share of the outline inside the image below which poses are dropped.
-        max_scale: images are reduced as a whole, for all distances, by this factor or more or not at all.
-        max_side_px: longer side of an image above which it is reduced whatever the distances.
-        side_unit_px: sides of reduced images are multiples of this, so that they can be halved.
-        scale: of the images in which poses are refined and measured, by the size of the part.
-        outline_scale: of the images in which the outline alone is judged: smaller, so that what differs between part
-            and CAD by less than some hundredths of the diameter does not count.
-        polish: of found poses.
     """
 
     radius_px: float = 20.0
@@ -122,37 +146,8 @@ class LocalSearchOptions:
             magnification=5.2, turn_step_deg=2.0, stretch_step=0.017, rounds=2, halvings=1, distinct_deg=2.5, points=96
         ),
     )
-    pad_share: float = 0.6
-    response_weight: float = 12.0
-    previous_weight: float = 0.5
-    max_coarse: int = 16
-    coarse_schedules: tuple[Schedule, ...] = (COARSE_STAGES, COARSE_COLOUR_STAGES)
-    max_fine: int = 5
-    max_competitors: int = 3
-    fine_schedules: tuple[Schedule, ...] = (SEARCH_STAGES, NEAR_STAGES)
     use_shading: bool = True
-    shading_stages: Schedule = SEARCH_STAGES[-1:]
     max_verified: int = 5
-    coarse_tolerance_px: float = 3.5
-    fine_tolerance_px: float = 1.5
-    coarse_distinct_deg: float = 3.0
-    distinct_deg: float = 5.0
-    competitor_deg: float = 25.0
-    competitor_distinct_deg: float = 15.0
-    min_score: float = 0.35
-    neighbourhood_rad: float = 0.05
-    max_shading_loss: float = 3.0
-    min_in_image: float = 0.4
-    max_scale: float = 0.8
-    max_side_px: int = 1280
-    side_unit_px: int = 8
-    scale: WorkingScaleOptions = field(
-        default_factory=lambda: WorkingScaleOptions(radius_px=120.0, max_enlargement=1.0)
-    )
-    outline_scale: WorkingScaleOptions = field(
-        default_factory=lambda: WorkingScaleOptions(radius_px=64.0, max_enlargement=1.0)
-    )
-    polish: PolishOptions = field(default_factory=PolishOptions)
 
 
 class LocalSearch:
@@ -197,21 +192,20 @@ class LocalSearch:
         if camera is not self.camera:
             reduced = np.asarray(cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA))
         clean = self._denoiser.denoise(reduced)
-        pyramid = ImagePyramid(clean, camera, round(self.options.pad_share * self.options.radius_px), self._edge_net)
+        pyramid = ImagePyramid(clean, camera, round(PAD_SHARE * self.options.radius_px), self._edge_net)
         if clean is reduced:
             pyramid.finest = (image, self.camera)
         return pyramid
 
     def _reduced(self, camera: Camera) -> Camera:
         """The camera of images in which the part at the farthest distance is as large as it is measured at most."""
-        o = self.options
         farthest_px = 0.25 * (camera.fx + camera.fy) * self.views.diameter_mm / self._distances_mm[1]
-        scale = min(o.scale.radius_px / max(farthest_px, 1e-9), o.max_side_px / max(camera.width, camera.height))
-        if scale > o.max_scale:
+        scale = min(SCALE.radius_px / max(farthest_px, 1e-9), MAX_SIDE_PX / max(camera.width, camera.height))
+        if scale > MAX_SCALE:
             return camera
         # Sides that can be halved several times.
         width, height = (
-            max(o.side_unit_px * round(scale * side / o.side_unit_px), o.side_unit_px)
+            max(SIDE_UNIT_PX * round(scale * side / SIDE_UNIT_PX), SIDE_UNIT_PX)
             for side in (camera.width, camera.height)
         )
         return camera.scaled(width, height)
@@ -279,8 +273,8 @@ class LocalSearch:
             return []
         view_lines = np.array([self.view_lines(pose) for pose in poses])
         scores = self._rough_ranker.scores(pyramid, poses, view_lines)
-        scores = scores + o.response_weight * weight_by_lines(responses, view_lines)
-        scores += o.previous_weight * before
+        scores = scores + RESPONSE_WEIGHT * weight_by_lines(responses, view_lines)
+        scores += PREVIOUS_WEIGHT * before
         order = np.argsort(-scores, kind="stable")
         scores, poses = scores[order], poses[order]
         share = 0.01 * level.distinct_deg
@@ -299,19 +293,17 @@ class LocalSearch:
         """Refined hypotheses before verification, apart from each other, best first."""
         o = self.options
         unrefined = self._refine_coarse(pyramid, [start.cam_from_body for start in starts], ())
-        best = [h.cam_from_body for h in sorted(unrefined, key=lambda h: -h.logit)[: o.max_coarse]]
-        coarse = [h for stages in o.coarse_schedules for h in self._refine_coarse(pyramid, best, stages)]
-        ranked = self.deduplicate([*unrefined, *coarse], o.coarse_distinct_deg)
+        best = [h.cam_from_body for h in sorted(unrefined, key=lambda h: -h.logit)[:MAX_COARSE]]
+        coarse = [h for stages in COARSE_SCHEDULES for h in self._refine_coarse(pyramid, best, stages)]
+        ranked = self.deduplicate([*unrefined, *coarse], COARSE_DISTINCT_DEG)
         others = [
-            h
-            for h in ranked[o.max_fine :]
-            if not self._same(h.cam_from_body, ranked[0].cam_from_body, o.competitor_deg)
+            h for h in ranked[MAX_FINE:] if not self._same(h.cam_from_body, ranked[0].cam_from_body, COMPETITOR_DEG)
         ]
-        chosen = ranked[: o.max_fine] + self.deduplicate(others, o.competitor_distinct_deg, o.max_competitors)
+        chosen = ranked[:MAX_FINE] + self.deduplicate(others, COMPETITOR_DISTINCT_DEG, MAX_COMPETITORS)
         refined = self.refine_fine(pyramid, [h.cam_from_body for h in chosen])
-        if refined and o.min_score <= refined[0].evidence.score < DECISION_SCORE:
-            refined += self.refine_fine(pyramid, _poses_around(refined[0].cam_from_body, o.neighbourhood_rad))
-        return self.deduplicate(refined, o.distinct_deg, o.max_verified)
+        if refined and MIN_SCORE <= refined[0].evidence.score < DECISION_SCORE:
+            refined += self.refine_fine(pyramid, _poses_around(refined[0].cam_from_body, NEIGHBOURHOOD_RAD))
+        return self.deduplicate(refined, DISTINCT_DEG, o.max_verified)
 
     def verify(self, pyramid: ImagePyramid, hypotheses: list[Hypothesis]) -> list[Hypothesis]:
         """Hypotheses with the scores of both verifiers, in their order; curved parts are refined by shading first."""
@@ -344,54 +336,50 @@ class LocalSearch:
 
     def _outline(self, pyramid: ImagePyramid, cam_from_body: Array) -> PoseEvidence:
         """Evidence of a pose (4,4) at the scale at which the outline alone is judged."""
-        image, gray, camera = pyramid.picture(self._step(pyramid, cam_from_body, self.options.outline_scale))
+        image, gray, camera = pyramid.picture(self._step(pyramid, cam_from_body, OUTLINE_SCALE))
         refiner = self.refiner.with_camera(camera)
         appearance = refiner.appearance_at(image, cam_from_body)
-        return refiner.evidence(image, gray, cam_from_body, appearance, self.options.fine_tolerance_px)
+        return refiner.evidence(image, gray, cam_from_body, appearance, FINE_TOLERANCE_PX)
 
     def _refine_by_shading(self, pyramid: ImagePyramid, hypotheses: list[Hypothesis]) -> list[Hypothesis]:
         """Hypotheses refined by the shading of the surface, each unless its log odds drop too far."""
-        o = self.options
 
         def refine(h: Hypothesis) -> tuple[Array, Schedule]:
             picture = self.work_picture(pyramid, h.cam_from_body)
             refiner = self.refiner.with_camera(picture.camera)
             appearance = refiner.appearance_at(picture.image, h.cam_from_body)
-            pose, information = refiner.refine(
-                picture.image, picture.gray, h.cam_from_body, o.shading_stages, appearance
-            )
+            pose, information = refiner.refine(picture.image, picture.gray, h.cam_from_body, SHADING_STAGES, appearance)
             return refiner.refine_shading(picture.gray, pose, information)[0], ()
 
-        shaded = self.refine_through(pyramid, list(pool().map(refine, hypotheses)), o.fine_tolerance_px)
+        shaded = self.refine_through(pyramid, list(pool().map(refine, hypotheses)), FINE_TOLERANCE_PX)
         return [
-            new if new.logit > old.logit - o.max_shading_loss else old
+            new if new.logit > old.logit - MAX_SHADING_LOSS else old
             for old, new in zip(hypotheses, shaded, strict=True)
         ]
 
     def _refine_coarse(self, pyramid: ImagePyramid, starts: Sequence[Array], stages: Schedule) -> list[Hypothesis]:
         """Hypotheses after some coarse stages from each start."""
-        return self.refine_through(pyramid, [(start, stages) for start in starts], self.options.coarse_tolerance_px)
+        return self.refine_through(pyramid, [(start, stages) for start in starts], COARSE_TOLERANCE_PX)
 
     def refine_fine(self, pyramid: ImagePyramid, starts: Sequence[Array]) -> list[Hypothesis]:
         """Hypotheses after all fine schedules from each start, best first, without those mostly outside the image."""
-        o = self.options
-        scheduled = [(start, stages) for start in starts for stages in o.fine_schedules]
-        found = self.refine_through(pyramid, scheduled, o.fine_tolerance_px)
+        scheduled = [(start, stages) for start in starts for stages in FINE_SCHEDULES]
+        found = self.refine_through(pyramid, scheduled, FINE_TOLERANCE_PX)
         is_in_range = self._are_in_range(np.array([h.cam_from_body for h in found]).reshape(-1, 4, 4))
         kept = [
             h
             for h, is_ok in zip(found, is_in_range, strict=True)
-            if is_ok and h.evidence.points_in_picture >= o.min_in_image
+            if is_ok and h.evidence.points_in_picture >= MIN_IN_IMAGE
         ]
         return self.deduplicate(kept, 0.0)
 
     def evaluate(self, pyramid: ImagePyramid, poses: Sequence[Array]) -> list[Hypothesis]:
         """Hypotheses of poses (4,4) as they are."""
-        return self.refine_through(pyramid, [(pose, ()) for pose in poses], self.options.fine_tolerance_px)
+        return self.refine_through(pyramid, [(pose, ()) for pose in poses], FINE_TOLERANCE_PX)
 
     def work_step(self, pyramid: ImagePyramid, cam_from_body: Array) -> int:
         """The scale step at which a pose (4,4) is refined and its evidence measured."""
-        return self._step(pyramid, cam_from_body, self.options.scale)
+        return self._step(pyramid, cam_from_body, SCALE)
 
     def _step(self, pyramid: ImagePyramid, cam_from_body: Array, scale: WorkingScaleOptions) -> int:
         """The scale step of the working picture at a pose (4,4)."""
@@ -411,8 +399,8 @@ class LocalSearch:
         """
         if self.refiner.part.is_curved:
             return cam_from_body
-        o, measured = self.options, self.work_picture(pyramid, cam_from_body)
-        return polish(self.refiner, pyramid, measured, cam_from_body, o.scale, o.polish)
+        measured = self.work_picture(pyramid, cam_from_body)
+        return polish(self.refiner, pyramid, measured, cam_from_body, SCALE)
 
     def refine_through(
         self, pyramid: ImagePyramid, scheduled: Sequence[tuple[Array, Schedule]], tolerance_px: float
@@ -450,7 +438,7 @@ class LocalSearch:
     def deduplicate(self, hypotheses: Iterable[Hypothesis], apart_deg: float, count: int = 1000) -> list[Hypothesis]:
         """The best ``count`` hypotheses, best first, without those close to a better one.
 
-        Of copies of one pose, closer than `LocalSearchOptions.distinct_deg`, the one with the best evidence stays.
+        Of copies of one pose, closer than `DISTINCT_DEG`, the one with the best evidence stays.
 
         Args:
             hypotheses: of one image.
@@ -464,7 +452,7 @@ class LocalSearch:
                 near[0].append(hypothesis)
             elif len(copies) < count:
                 copies.append([hypothesis])
-        if apart_deg > self.options.distinct_deg:
+        if apart_deg > DISTINCT_DEG:
             return [some[0] for some in copies]
         chosen = [max(some, key=lambda h: h.evidence_logit) for some in copies]
         return sorted(chosen, key=lambda h: -h.logit)

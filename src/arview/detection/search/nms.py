@@ -10,9 +10,13 @@ from arview.core.kernel import kernel
 
 @kernel
 def select_distinct(
-    rotations: NDArray[np.float64], positions: NDArray[np.float64], reach: NDArray[np.float64], cosine: float,
-    distance_ratio: float, most: int
-) -> NDArray[np.int64]:  # fmt: skip
+    rotations: NDArray[np.float64],
+    positions: NDArray[np.float64],
+    reach: NDArray[np.float64],
+    cosine: float,
+    distance_ratio: float,
+    most: int,
+) -> NDArray[np.int64]:
     """Indices of at most ``most`` poses, best first as given, none close to a better one.
 
     Args:

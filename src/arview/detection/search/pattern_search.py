@@ -29,10 +29,18 @@ MAX_OUTLINE_REACH = 1.4
 
 @kernel
 def pose_score(
-    maps: NDArray[np.uint8], part: ViewArrays, pose: NDArray[np.float64], intrinsics: NDArray[np.float64],
-    step_mm: float, contour_count: int, edge_count: int, shift_px: int, shift_step: int, buffer: NDArray[np.int64],
-    sums: NDArray[np.int32]
-) -> tuple[float, int, int]:  # fmt: skip
+    maps: NDArray[np.uint8],
+    part: ViewArrays,
+    pose: NDArray[np.float64],
+    intrinsics: NDArray[np.float64],
+    step_mm: float,
+    contour_count: int,
+    edge_count: int,
+    shift_px: int,
+    shift_step: int,
+    buffer: NDArray[np.int64],
+    sums: NDArray[np.int32],
+) -> tuple[float, int, int]:
     """Mean response 0–1 at a pose, and the best shift dx, dy in px; 0 with too few points.
 
     Args:
@@ -71,10 +79,20 @@ def _stepped(pose: NDArray[np.float64], axis: int, amount: float) -> NDArray[np.
 
 @kernel
 def search_poses(
-    maps: NDArray[np.uint8], part: ViewArrays, poses: NDArray[np.float64], intrinsics: NDArray[np.float64],
-    step_mm: float, turn_step_rad: float, stretch_step: float, rounds: int, halvings: int, shift_px: int,
-    shift_step: int, contour_count: int, edge_count: int
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:  # fmt: skip
+    maps: NDArray[np.uint8],
+    part: ViewArrays,
+    poses: NDArray[np.float64],
+    intrinsics: NDArray[np.float64],
+    step_mm: float,
+    turn_step_rad: float,
+    stretch_step: float,
+    rounds: int,
+    halvings: int,
+    shift_px: int,
+    shift_step: int,
+    contour_count: int,
+    edge_count: int,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Improve poses independently of each other.
 
     Args:
@@ -107,9 +125,18 @@ def search_poses(
                     for sign in range(-1, 2, 2):
                         trial = _stepped(pose, axis, sign * (stretch if axis == 3 else turn))
                         score, dx, dy = pose_score(
-                            maps, part, trial, intrinsics, step_mm, contour_count, edge_count, shift_px, shift_step,
-                            buffer, sums
-                        )  # fmt: skip
+                            maps,
+                            part,
+                            trial,
+                            intrinsics,
+                            step_mm,
+                            contour_count,
+                            edge_count,
+                            shift_px,
+                            shift_step,
+                            buffer,
+                            sums,
+                        )
                         if score > best:
                             best = score
                             trial[0, 3] += dx * trial[2, 3] / intrinsics[0]
@@ -128,10 +155,24 @@ def search_poses(
 
 @kernel
 def outline_score(
-    maps: NDArray[np.uint8], points: NDArray[np.float32], angles: NDArray[np.uint8], roll: float, radius_px: float,
-    nearness: float, x0: float, y0: float, shift_px: int, shift_step: int, is_trimmed: bool, pad_px: int,
-    min_cut_px: float, floor: float, buffer: NDArray[np.int64], sums: NDArray[np.int32], sectors: NDArray[np.int64]
-) -> tuple[float, int, int]:  # fmt: skip
+    maps: NDArray[np.uint8],
+    points: NDArray[np.float32],
+    angles: NDArray[np.uint8],
+    roll: float,
+    radius_px: float,
+    nearness: float,
+    x0: float,
+    y0: float,
+    shift_px: int,
+    shift_step: int,
+    is_trimmed: bool,
+    pad_px: int,
+    min_cut_px: float,
+    floor: float,
+    buffer: NDArray[np.int64],
+    sums: NDArray[np.int32],
+    sectors: NDArray[np.int64],
+) -> tuple[float, int, int]:
     """Mean response 0–1 of an outline at a roll, size and place, and the best shift dx, dy in px.
 
     Args:
@@ -176,7 +217,7 @@ def outline_score(
 @kernel
 def _trimmed_sum(
     maps: NDArray[np.uint8], buffer: NDArray[np.int64], count: int, dx: int, dy: int, sums: NDArray[np.int64]
-) -> int | np.int64:  # fmt: skip
+) -> int | np.int64:
     """Sum of the responses under the points of an outline at a shift, without the lowest adjacent pair of sectors."""
     height, width = maps.shape[1], maps.shape[2]
     sums[:] = 0

@@ -38,21 +38,14 @@ DOMAIN_DIRECTION = np.array([0.36, 0.48, 0.8])
 """Direction that chooses one of several symmetric views; it lies on no axis or plane of a likely symmetry."""
 
 
-@dataclass(frozen=True)
-class OutlineOptions:
-    """Options of the outlines.
-
-    Attributes:
-        points: points of an outline, a multiple of `FIRST_POINTS`.
-        max_inner_share: largest share of design edges inside the outline among the points.
-        subdivisions: icosahedron level of the directions that have an outline (4: 2,562, about 4° apart).
-        far_deg: angle to the far neighbours of a direction, about twice the spacing of the directions.
-    """
-
-    points: int = 64
-    max_inner_share: float = 0.35
-    subdivisions: int = 4
-    far_deg: float = 8.5
+POINTS = 64
+"""Points of an outline, a multiple of `FIRST_POINTS`."""
+MAX_INNER_SHARE = 0.35
+"""Largest share of design edges inside the outline among the points."""
+SUBDIVISIONS = 4
+"""Icosahedron level of the directions that have an outline (4: 2,562, about 4° apart)."""
+FAR_DEG = 8.5
+"""Angle to the far neighbours of a direction, about twice the spacing of the directions."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +73,7 @@ class ViewOutlines:
         view_lines: (V,) distinct lines that the views show.
         groups: (V,) group of similar views, below `GROUPS`.
         near: nearest other directions.
-        far: directions on all sides at `OutlineOptions.far_deg`.
+        far: directions on all sides at `FAR_DEG`.
     """
 
     points: NDArray[np.float32]
@@ -115,25 +108,23 @@ class TemplateBank:
     gains: Array
 
 
-def make_outlines(views: GuideViewSet, model_from_body: Array, options: OutlineOptions | None = None) -> ViewOutlines:
+def make_outlines(views: GuideViewSet, model_from_body: Array) -> ViewOutlines:
     """Outlines over the directions of the declared range.
 
     Args:
         views: guide views of the part; the one nearest to each direction of an icosphere is used.
         model_from_body: (4,4) from the part's centre to the model.
-        options: see `OutlineOptions`; views with few points repeat some.
 
     Raises:
         InputError: no view shows an outline.
     """
-    o = options or OutlineOptions()
     focal = 1000.0
     intrinsics = np.array([focal, focal, 0.0, 0.0, 0, 0, 0, 0, 0, 0])
     rows: list[tuple[Array, Array, Array, Array]] = []
-    for index in _nearest_views(views, o.subdivisions):
+    for index in _nearest_views(views, SUBDIVISIONS):
         view = views.view(int(index))
         cam_from_body = view.cam_from_model @ model_from_body
-        found = _view_points(view.features, views.center_in_model, cam_from_body, o)
+        found = _view_points(view.features, views.center_in_model, cam_from_body)
         if found is None:
             continue
         body, directions, across = found
@@ -149,7 +140,7 @@ def make_outlines(views: GuideViewSet, model_from_body: Array, options: OutlineO
     if not rows:
         raise InputError("guide views: no view shows an outline; check the model and the declared distances")
     shown, angles, rotations, seen_from = (np.stack([row[k] for row in rows]) for k in range(4))
-    near, far = _neighbours(seen_from, 6, o.far_deg)
+    near, far = _neighbours(seen_from, 6, FAR_DEG)
     line_counts = ViewLineCounts(views)
     return ViewOutlines(
         points=shown.astype(np.float32),
@@ -315,7 +306,7 @@ def make_bank(
 
 
 def _view_points(
-    features: ViewFeatures, center: Array, cam_from_body: Array, options: OutlineOptions
+    features: ViewFeatures, center: Array, cam_from_body: Array
 ) -> tuple[Array, Array, NDArray[np.bool_]] | None:
     """Points of outline and design edges about the centre, with their directions.
 
@@ -328,8 +319,8 @@ def _view_points(
     edges = features.edge_points[inner] - center
     is_ahead = (contour @ cam_from_body[2, :3] + cam_from_body[2, 3]) > 1.0
     contour, normals = contour[is_ahead], features.contour_normals[is_ahead]
-    inner_count = min(len(edges), int(options.max_inner_share * options.points))
-    outer_count = options.points - inner_count
+    inner_count = min(len(edges), int(MAX_INNER_SHARE * POINTS))
+    outer_count = POINTS - inner_count
     if len(contour) < 8:
         return None
     outer, inside = _spread(len(contour), outer_count), _spread(len(edges), inner_count)

@@ -76,9 +76,15 @@ def decimate_with_border(maps: NDArray[np.uint8], step: int, pad_px: int, margin
 
 @kernel
 def _add_points(
-    total: NDArray[np.uint16], flat: NDArray[np.uint8], source: NDArray[np.int64], shift: NDArray[np.int64],
-    start: int, size: int, first: int, last: int
-) -> None:  # fmt: skip
+    total: NDArray[np.uint16],
+    flat: NDArray[np.uint8],
+    source: NDArray[np.int64],
+    shift: NDArray[np.int64],
+    start: int,
+    size: int,
+    first: int,
+    last: int,
+) -> None:
     """Add the responses under points ``first`` to ``last`` to the sums of a tile, four points at a time in 8 bits."""
     for i in range(first, last, 4):
         a = flat[source[i], shift[i] + start : shift[i] + start + size]
@@ -91,15 +97,23 @@ def _add_points(
 
 @kernel
 def _add_trimmed(
-    total: NDArray[np.uint16], own: NDArray[np.uint16], lowest: NDArray[np.uint16], flat: NDArray[np.uint8],
-    source: NDArray[np.int64], shift: NDArray[np.int64], start: int, size: int
-) -> None:  # fmt: skip
+    total: NDArray[np.uint16],
+    own: NDArray[np.uint16],
+    lowest: NDArray[np.uint16],
+    flat: NDArray[np.uint8],
+    source: NDArray[np.int64],
+    shift: NDArray[np.int64],
+    start: int,
+    size: int,
+) -> None:
     """Add the responses under the first points, without the adjacent pair of sectors that has the lowest sum."""
     each = FIRST_POINTS // SECTORS
     for sector in range(SECTORS):
         one = own[sector]
         one[:size] = 0
-        _add_points(one, flat, source, shift, start, size, sector * each, (sector + 1) * each)
+        _add_points(
+            one, flat, source, shift=shift, start=start, size=size, first=sector * each, last=(sector + 1) * each
+        )
         for k in range(size):
             total[k] += one[k]
     lowest[:size] = 65535
@@ -125,7 +139,7 @@ def _threshold(votes: NDArray[np.int64], kept: int) -> float:
 @kernel
 def _surviving(
     keys: NDArray[np.float64], groups: NDArray[np.int32], found: int, votes: NDArray[np.int64], kept: int
-) -> NDArray[np.int64]:  # fmt: skip
+) -> NDArray[np.int64]:
     """Indices of those of the first ``found`` matches that still reach the thresholds of their groups."""
     thresholds = np.array([_threshold(votes[g], kept) for g in range(len(votes))])
     return np.array([i for i in range(found) if keys[i] >= thresholds[groups[i]]], dtype=np.int64)
@@ -148,15 +162,26 @@ def _place_points(offsets: Any, bins: Any, step: Any, columns: Any, source: Any,
 @kernel(inline=True)
 def _sum_first_points(
     total: Any, own: Any, lowest: Any, flat: Any, source: Any, shift: Any, span: Any, is_trimmed: Any
-) -> Any:  # fmt: skip
+) -> Any:
     """Write the sums of the first points at ``span`` places to ``total``, tile by tile."""
     for start in range(0, span, TILE):
         size = min(TILE, span - start)
         total[start : start + size] = 0
         if is_trimmed:
-            _add_trimmed(total[start : start + size], own, lowest, flat, source, shift, start, size)
+            _add_trimmed(
+                total[start : start + size], own, lowest, flat=flat, source=source, shift=shift, start=start, size=size
+            )
         else:
-            _add_points(total[start : start + size], flat, source, shift, start, size, 0, FIRST_POINTS)
+            _add_points(
+                total[start : start + size],
+                flat,
+                source,
+                shift=shift,
+                start=start,
+                size=size,
+                first=0,
+                last=FIRST_POINTS,
+            )
 
 
 @kernel(inline=True)
@@ -207,7 +232,9 @@ def _add_inside(inside: Any, flat: Any, source: Any, shift: Any, span: Any) -> A
     for start in range(0, span, TILE):
         size = min(TILE, span - start)
         inside[start : start + size] = 0
-        _add_points(inside[start : start + size], flat, source, shift, start, size, 0, FIRST_POINTS)
+        _add_points(
+            inside[start : start + size], flat, source, shift=shift, start=start, size=size, first=0, last=FIRST_POINTS
+        )
 
 
 @kernel(inline=True)
@@ -234,9 +261,14 @@ def _is_peak(total: Any, k: Any, span: Any, columns: Any) -> Any:
 
 @kernel
 def _compact(
-    keys: NDArray[np.float64], templates: NDArray[np.int32], cells: NDArray[np.int32], groups: NDArray[np.int32],
-    found: int, votes: NDArray[np.int64], kept: int
-) -> int:  # fmt: skip
+    keys: NDArray[np.float64],
+    templates: NDArray[np.int32],
+    cells: NDArray[np.int32],
+    groups: NDArray[np.int32],
+    found: int,
+    votes: NDArray[np.int64],
+    kept: int,
+) -> int:
     """Move the surviving matches to the front of full buffers, and return their number.
 
     More than half of the buffer survives only if thousands have the same key; any of these will do.

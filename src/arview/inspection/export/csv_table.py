@@ -12,12 +12,41 @@ from arview.inspection.record import ComponentDeviation, Inspection
 from arview.inspection.rounding import decimals_beside_limit, decimals_of, exact, fixed
 
 HEADER = (
-    "part", "serial", "measured_utc", "component", "verdict", "finding",
-    "nominal_x_mm", "nominal_y_mm", "nominal_z_mm", "measured_x_mm", "measured_y_mm", "measured_z_mm",
-    "dx_mm", "dy_mm", "dz_mm", "distance_mm", "U_mm", "k", "low_95_mm", "high_95_mm", "tolerance_mm",
-    "position_diameter_mm", "tilt_deg", "twist_deg", "angle_deg", "angle_U_deg", "angle_tolerance_deg", "notes",
-    "inspection_sha256", "point", "decision", "decision_reason", "decision_by", "decision_utc",
-)  # fmt: skip
+    "part",
+    "serial",
+    "measured_utc",
+    "component",
+    "verdict",
+    "finding",
+    "nominal_x_mm",
+    "nominal_y_mm",
+    "nominal_z_mm",
+    "measured_x_mm",
+    "measured_y_mm",
+    "measured_z_mm",
+    "dx_mm",
+    "dy_mm",
+    "dz_mm",
+    "distance_mm",
+    "U_mm",
+    "k",
+    "low_95_mm",
+    "high_95_mm",
+    "tolerance_mm",
+    "position_diameter_mm",
+    "tilt_deg",
+    "twist_deg",
+    "angle_deg",
+    "angle_U_deg",
+    "angle_tolerance_deg",
+    "notes",
+    "inspection_sha256",
+    "point",
+    "decision",
+    "decision_reason",
+    "decision_by",
+    "decision_utc",
+)
 """Columns. Cells of undetermined or unmeasured values are empty."""
 
 
@@ -58,19 +87,28 @@ def _row(inspection: Inspection, one: ComponentDeviation) -> list[str]:
         angle, angle_u, angle_limit = details.angle_deg, details.angle_uncertainty_deg, details.angle_tolerance_deg
     angle_decimals = decimals_of(angle_u)
     return [
-        inspection.part, inspection.serial, inspection.created.strftime("%Y-%m-%dT%H:%M:%SZ"), one.name,
-        one.verdict.value, "" if one.finding is None else one.finding.value,
+        inspection.part,
+        inspection.serial,
+        inspection.created.strftime("%Y-%m-%dT%H:%M:%SZ"),
+        one.name,
+        one.verdict.value,
+        "" if one.finding is None else one.finding.value,
         *(_exact(value) for value in center),
         *(_rounded(value, decimals) for value in (*moved, *one.displacement_mm)),
         _rounded(one.distance_mm, decimals_beside_limit(one.distance_mm or 0.0, u, tolerance)),
-        _rounded(u, decimals), _exact(None if details is None else details.k),
-        _rounded(low, decimals), _rounded(high, decimals), _exact(tolerance),
+        _rounded(u, decimals),
+        _exact(None if details is None else details.k),
+        _rounded(low, decimals),
+        _rounded(high, decimals),
+        _exact(tolerance),
         _rounded(zone, decimals_beside_limit(zone or 0.0, u, None if tolerance is None else 2.0 * tolerance)),
-        _rounded(one.tilt_deg, angle_decimals), _rounded(one.twist_deg, angle_decimals),
+        _rounded(one.tilt_deg, angle_decimals),
+        _rounded(one.twist_deg, angle_decimals),
         _rounded(angle, decimals_beside_limit(angle or 0.0, angle_u, angle_limit)),
-        _rounded(angle_u, angle_decimals), _exact(angle_limit),
+        _rounded(angle_u, angle_decimals),
+        _exact(angle_limit),
         "" if details is None else "; ".join(details.notes),
-    ]  # fmt: skip
+    ]
 
 
 def _point(one: ComponentDeviation) -> str:

@@ -85,8 +85,14 @@ def _characteristics(one: ComponentDeviation) -> list[_Characteristic]:
     tilt_decimals = 3 if angle_u is None else decimals_beside_limit(one.tilt_deg or 0.0, angle_u, limit)
     return [
         _Characteristic(
-            f"{one.name}.distance", f"{one.name} distance from design place", "mm", distance_decimals,
-            one.tolerance_mm, True, one.distance_mm, remark,
+            f"{one.name}.distance",
+            f"{one.name} distance from design place",
+            "mm",
+            decimals=distance_decimals,
+            upper=one.tolerance_mm,
+            is_length_from_zero=True,
+            value=one.distance_mm,
+            remark=remark,
         ),
         *(
             _Characteristic(f"{one.name}.d{axis}", f"{one.name} d{axis}", "mm", decimals, None, False, value)
@@ -94,10 +100,18 @@ def _characteristics(one: ComponentDeviation) -> list[_Characteristic]:
         ),
         _Characteristic(f"{one.name}.tilt", f"{one.name} tilt", "deg", tilt_decimals, limit, True, one.tilt_deg),
         _Characteristic(
-            f"{one.name}.presence", f"{one.name} is present", "", 0, None, False, None,
-            "missing" if one.is_present is False else "", one.is_present, True,
+            f"{one.name}.presence",
+            f"{one.name} is present",
+            "",
+            decimals=0,
+            upper=None,
+            is_length_from_zero=False,
+            value=None,
+            remark="missing" if one.is_present is False else "",
+            is_present=one.is_present,
+            is_attribute=True,
         ),
-    ]  # fmt: skip
+    ]
 
 
 def _value(index: int, row: _Characteristic) -> list[tuple[str, str]]:

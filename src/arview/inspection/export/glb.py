@@ -95,9 +95,12 @@ def _material(color: tuple[float, float, float, float]) -> Any:
     rgb = np.array(color[:3])
     linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
     return PBRMaterial(
-        baseColorFactor=[*linear.tolist(), color[3]], metallicFactor=0.0, roughnessFactor=0.8, doubleSided=True,
+        baseColorFactor=[*linear.tolist(), color[3]],
+        metallicFactor=0.0,
+        roughnessFactor=0.8,
+        doubleSided=True,
         alphaMode="BLEND" if color[3] < 1.0 else "OPAQUE",
-    )  # fmt: skip
+    )
 
 
 def _arrow(deviation: ComponentDeviation, tail: Array, scale: float, width_mm: float) -> Any:

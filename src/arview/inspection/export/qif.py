@@ -268,8 +268,10 @@ def _angle_status(one: ComponentDeviation) -> str:
     """Status of the rotation by the same decision rule as the position, with the full U as guard band."""
     assert one.details is not None
     limit, angle, uncertainty = (
-        one.details.angle_tolerance_deg, one.details.angle_deg, one.details.angle_uncertainty_deg,
-    )  # fmt: skip
+        one.details.angle_tolerance_deg,
+        one.details.angle_deg,
+        one.details.angle_uncertainty_deg,
+    )
     if angle is None:
         return _status_without_value(one)
     if limit is None:

@@ -9,8 +9,8 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,6 @@ from arview.cad.model import Component, Model
 from arview.cad.part import Part
 from arview.errors import InputError
 from arview.geometry import Array, apply, invert, rigid
-from arview.measurement.cloud.classical_icp import ClassicalIcpOptions, icp_move
 from arview.measurement.cloud.mesh_surface import MeshSurface
 from arview.measurement.cloud.placing import check_belongs
 from arview.measurement.cloud.points import CloudPoints, prepare_cloud
@@ -36,56 +35,38 @@ from arview.measurement.cloud.visibility import SurfaceVisibility
 from arview.measurement.types import Move, NotMeasured
 from arview.reconstruction.types import DenseCloud, PosedPhoto
 
-
-@dataclass(frozen=True)
-class CloudDeviationOptions:
-    """Options of measuring components in a cloud.
-
-    Attributes:
-        band_mm: distance from its nominal surface within which a component's points are searched for; larger
-            displacements are not found, and much larger bands include the neighbours.
-        grid_mm: cell of the grid on which the cloud is averaged; neighbouring points hold no more information.
-        joint_mm: points nearer to another component are left out: weld beads, and points of that component. For a flat
-            component at most a quarter of its height.
-        min_photos: a piece of surface counts as visible when this many photos show it; two photos make a point.
-        min_support: share of its visible surface that fitting points must cover for a component to be measured.
-        min_fitting: share of the points near it that must fit; otherwise it is something else.
-        max_noise_mm: largest spread of the residuals for points that are a surface of this component.
-        doubt_width_mm: width of the kernel in a second fit, whose difference is added to the covariance.
-        max_std_mm: directions with a larger standard deviation are undetermined.
-        missing_share: a component is missing when a smaller share of its visible surface has a point within the band.
-        min_points: of a component.
-        scanned_mm: without photos, surface farther from every point of the cloud was not scanned, and is not expected.
-        rival_cost: a second minimum is reported when its cost is less than this many times the best one's.
-        rival_mm: minima nearer to each other are one, and not reported.
-        registration: options of the solver.
-        way: ``icp`` replaces each position by that of the classical ICP, for comparison.
-        icp: its options.
-    """
-
-    band_mm: float = 5.0
-    grid_mm: float = 0.5
-    joint_mm: float = 2.0
-    min_photos: int = 2
-    min_support: float = 0.45
-    min_fitting: float = 0.7
-    max_noise_mm: float = 0.7
-    doubt_width_mm: float = 0.4
-    max_std_mm: float = 0.5
-    missing_share: float = 0.2
-    min_points: int = 60
-    rival_cost: float = 1.5
-    scanned_mm: float = 6.0
-    rival_mm: float = 0.2
-    way: Literal["surface", "icp"] = "surface"
-    icp: ClassicalIcpOptions = field(default_factory=ClassicalIcpOptions)
-    registration: RegistrationOptions = field(
-        default_factory=lambda: RegistrationOptions(min_width_mm=0.1, threshold_mm=1e-3, threshold_deg=1e-3)
-    )
-
-    def __post_init__(self) -> None:
-        if not (self.band_mm > 0 and self.grid_mm >= 0 and self.joint_mm >= 0):
-            raise InputError("cloud measurement: band, grid and joint must be positive")
+BAND_MM = 5.0
+"""Distance from its nominal surface within which a component's points are searched for; larger displacements are not
+found, and much larger bands include the neighbours."""
+GRID_MM = 0.5
+"""Cell of the grid on which the cloud is averaged; neighbouring points hold no more information."""
+JOINT_MM = 2.0
+"""Points nearer to another component are left out: weld beads, and points of that component. For a flat component at
+most a quarter of its height."""
+MIN_PHOTOS = 2
+"""A piece of surface counts as visible when this many photos show it; two photos make a point."""
+MIN_SUPPORT = 0.45
+"""Share of its visible surface that fitting points must cover for a component to be measured."""
+MIN_FITTING = 0.7
+"""Share of the points near it that must fit; otherwise it is something else."""
+MAX_NOISE_MM = 0.7
+"""Largest spread of the residuals for points that are a surface of this component."""
+DOUBT_WIDTH_MM = 0.4
+"""Width of the kernel in a second fit, whose difference is added to the covariance."""
+MAX_STD_MM = 0.5
+"""Directions with a larger standard deviation are undetermined."""
+MISSING_SHARE = 0.2
+"""A component is missing when a smaller share of its visible surface has a point within the band."""
+MIN_POINTS = 60
+"""Of a component."""
+RIVAL_COST = 1.5
+"""A second minimum is reported when its cost is less than this many times the best one's."""
+SCANNED_MM = 6.0
+"""Without photos, surface farther from every point of the cloud was not scanned, and is not expected."""
+RIVAL_MM = 0.2
+"""Minima nearer to each other are one, and not reported."""
+REGISTRATION = RegistrationOptions(min_width_mm=0.1, threshold_mm=1e-3, threshold_deg=1e-3)
+"""Options of the solver."""
 
 
 @dataclass(frozen=True)
@@ -99,7 +80,7 @@ class CloudComponent:
         contact: (C,3) samples where it touches others.
         usable_faces: (F,) faces that the photos can see.
         spins: (K,6) motions about the centre, rotations scaled by ``radius_mm``, that leave its shape unchanged.
-        joint_mm: see `CloudDeviationOptions`.
+        joint_mm: as `JOINT_MM`, and of a flat component at most a quarter of its height.
     """
 
     component: Component
@@ -127,7 +108,6 @@ def measure_components_in_cloud(
     model: Model,
     part: Part,
     photos: Sequence[PosedPhoto] = (),
-    options: CloudDeviationOptions | None = None,
     names: Sequence[str] | None = None,
 ) -> list[Move | NotMeasured]:
     """Measure the moves of the components to be inspected, in the order of the model.
@@ -138,41 +118,33 @@ def measure_components_in_cloud(
         part: roles and symmetries.
         photos: with ``cam_from_scan`` in the same frame, for what is visible; without them everything counts as visible
             that does not touch another component.
-        options: see `CloudDeviationOptions`.
         names: components to measure; default: those to be inspected.
 
     Raises:
         InputError: the cloud is empty, far from the CAD, of another part, or mirrored.
     """
-    o = options or CloudDeviationOptions()
-    box = model.bounds_in_model + np.array([[-o.band_mm], [o.band_mm]])
-    points = prepare_cloud(cloud, box, o.grid_mm, o.min_points)
-    check_belongs(points, model, o.band_mm)
+    box = model.bounds_in_model + np.array([[-BAND_MM], [BAND_MM]])
+    points = prepare_cloud(cloud, box, GRID_MM, MIN_POINTS)
+    check_belongs(points, model, BAND_MM)
     views = SurfaceVisibility(model, photos) if photos else None
     # One thread for BLAS: the matrices are small, and the work is parallel over components.
     with threadpool_limits(1, "blas"), ThreadPoolExecutor(max(1, min(4, os.cpu_count() or 1))) as threads:
-        components = list(
-            threads.map(lambda name: _cloud_component(name, model, part, views, o), names or part.inspected)
-        )
+        components = list(threads.map(lambda name: cloud_component(name, model, part, views), names or part.inspected))
         if views is None:
-            components = _only_scanned(components, points, o)
-        first = list(threads.map(lambda c: _measure(c, points, None, o), components))
+            components = _only_scanned(components, points)
+        first = list(threads.map(lambda c: _measure(c, points, None), components))
         places = {m.component: m.measured_from_nominal for m in first if isinstance(m, Move)}
 
         def again(index: int) -> Move | NotMeasured:
             c, found = components[index], first[index]
-            if not isinstance(found, Move) or not _has_moved_neighbour(c, model, first, o):
+            if not isinstance(found, Move) or not _has_moved_neighbour(c, model, first):
                 return found
-            moved = replace(c, others=_around(c.component, model, places, o))
-            return _measure(moved, points, found.nominal_from_measured, o)
+            moved = replace(c, others=_around(c.component, model, places))
+            return _measure(moved, points, found.nominal_from_measured)
 
         second = list(threads.map(again, range(len(components))))
-        if o.way == "icp":
-            second = [_by_icp(found, c, points, o) for found, c in zip(second, components, strict=True)]
         return list(
-            threads.map(
-                lambda i: _with_swapped_name(second[i], components[i], components, points, o), range(len(second))
-            )
+            threads.map(lambda i: _with_swapped_name(second[i], components[i], components, points), range(len(second)))
         )
 
 
@@ -200,39 +172,41 @@ def spin_moves(component: Component, surface: MeshSurface, part: Part | None, mi
     return vectors[values > 0.1]
 
 
-def _cloud_component(
-    name: str, model: Model, part: Part | None, views: SurfaceVisibility | None, o: CloudDeviationOptions
-) -> CloudComponent:  # fmt: skip
+def cloud_component(name: str, model: Model, part: Part | None, views: SurfaceVisibility | None) -> CloudComponent:
     """A component with what the photos can see of it, and with its neighbours at nominal."""
     component = model.component(name)
     surface = MeshSurface(component.vertices_in_model, component.faces)
-    others = _around(component, model, {}, o)
-    spacing = max(o.grid_mm, 0.3, float(np.sqrt(surface.areas.sum() / 4000.0)))
+    others = _around(component, model, {})
+    spacing = max(GRID_MM, 0.3, float(np.sqrt(surface.areas.sum() / 4000.0)))
     spread, of_face = surface.sample(spacing)
     tried = np.concatenate([spread, surface.triangles.mean(axis=1)])
     faces = np.concatenate([of_face, np.arange(len(surface.faces))])
     to_others = np.full(len(tried), np.inf)
     if others is not None:
-        closest = others.closest(tried, 10.0 * max(o.joint_mm, 1.0))
+        closest = others.closest(tried, 10.0 * max(JOINT_MM, 1.0))
         to_others = np.where(closest.faces >= 0, np.abs(closest.distances), np.inf)
     touches = to_others < 0.2
     seen = ~touches
     if views is not None:
-        seen &= views.count(tried, surface.face_normals[faces]) >= o.min_photos
+        seen &= views.count(tried, surface.face_normals[faces]) >= MIN_PHOTOS
     height = float(np.max(to_others[np.isfinite(to_others)], initial=0.0)) if others is not None else np.inf
-    joint = min(o.joint_mm, 0.25 * height)
+    joint = min(JOINT_MM, 0.25 * height)
     usable = np.zeros(len(surface.faces), dtype=bool)
     usable[faces[seen]] = True
     is_spread = np.arange(len(tried)) < len(spread)
     return CloudComponent(
-        component, surface, others, tried[is_spread & seen & (to_others > joint)], tried[is_spread & touches], usable,
-        spin_moves(component, surface, part), joint,
-    )  # fmt: skip
+        component,
+        surface,
+        others,
+        samples=tried[is_spread & seen & (to_others > joint)],
+        contact=tried[is_spread & touches],
+        usable_faces=usable,
+        spins=spin_moves(component, surface, part),
+        joint_mm=joint,
+    )
 
 
-def _only_scanned(
-    components: Sequence[CloudComponent], points: CloudPoints, o: CloudDeviationOptions
-) -> list[CloudComponent]:
+def _only_scanned(components: Sequence[CloudComponent], points: CloudPoints) -> list[CloudComponent]:
     """The components with those samples that have any point of the cloud near them.
 
     Samples of a component of which nothing was scanned are all kept: it is missing, or not covered.
@@ -241,16 +215,14 @@ def _only_scanned(
 
     tree, out = cKDTree(points.points), []
     for c in components:
-        near = np.isfinite(tree.query(c.samples, distance_upper_bound=o.scanned_mm)[0]) if len(c.samples) else []
+        near = np.isfinite(tree.query(c.samples, distance_upper_bound=SCANNED_MM)[0]) if len(c.samples) else []
         out.append(replace(c, samples=c.samples[near]) if np.count_nonzero(near) > 0.1 * len(c.samples) else c)
     return out
 
 
-def _around(
-    component: Component, model: Model, places: dict[str, Array], o: CloudDeviationOptions
-) -> MeshSurface | None:
+def _around(component: Component, model: Model, places: dict[str, Array]) -> MeshSurface | None:
     """Surface of the components near one, each at its measured place or at nominal; None without neighbours."""
-    reach = 2.0 * o.band_mm + o.joint_mm
+    reach = 2.0 * BAND_MM + JOINT_MM
     low, high = component.bounds_in_model[0] - reach, component.bounds_in_model[1] + reach
     vertices, faces, groups, offset = [], [], [], 0
     for index, other in enumerate(model.components):
@@ -269,96 +241,72 @@ def _around(
     return MeshSurface(np.concatenate(vertices), np.concatenate(faces), np.concatenate(groups))
 
 
-def _has_moved_neighbour(
-    c: CloudComponent, model: Model, found: Sequence[Move | NotMeasured], o: CloudDeviationOptions
-) -> bool:
+def _has_moved_neighbour(c: CloudComponent, model: Model, found: Sequence[Move | NotMeasured]) -> bool:
     """Whether a neighbour is displaced so far that different points must be left out because of it."""
     low, high = c.component.bounds_in_model
     for one in found:
         if not isinstance(one, Move) or one.component == c.component.name:
             continue
         corners = model.component(one.component).bounds_in_model
-        reach = 2.0 * o.band_mm + o.joint_mm
+        reach = 2.0 * BAND_MM + JOINT_MM
         is_near = bool((corners[1] > low - reach).all() and (corners[0] < high + reach).all())
-        if is_near and np.linalg.norm(one.twist * ([one.radius_mm] * 3 + [1.0] * 3)) > 0.1 * o.joint_mm:
+        if is_near and np.linalg.norm(one.twist * ([one.radius_mm] * 3 + [1.0] * 3)) > 0.1 * JOINT_MM:
             return True
     return False
 
 
-def _measure(
-    c: CloudComponent, cloud: CloudPoints, start: Array | None, o: CloudDeviationOptions
-) -> Move | NotMeasured:
+def _measure(c: CloudComponent, cloud: CloudPoints, start: Array | None) -> Move | NotMeasured:
     """Move of one component, or why there is none; ``start`` (4,4) is nominal_from_measured, None tries several."""
     name = c.component.name
     if len(c.samples) == 0:
         return NotMeasured(name, "cloud", "none of its surface is visible in the photos")
-    near, own = _crop(c, cloud, o)
-    missing = _missing(c, near, own, o)
+    near, own = crop_component(c, cloud)
+    missing = _missing(c, near, own)
     if missing is not None:
         return missing
-    if len(own) < o.min_points:
-        return NotMeasured(name, "cloud", f"only {len(own)} points of it are in the cloud; {o.min_points} are needed")
+    if len(own) < MIN_POINTS:
+        return NotMeasured(name, "cloud", f"only {len(own)} points of it are in the cloud; {MIN_POINTS} are needed")
     try:
-        fit = _register(c, own, start, o)
+        fit = _register(c, own, start)
     except InputError as error:
         return NotMeasured(name, "cloud", str(error).removeprefix("registration: "))
-    support = _covered(apply(invert(fit.surface_from_points), c.samples), own.points, max(1.0, 2.0 * o.grid_mm), fit)
+    support = _covered(apply(invert(fit.surface_from_points), c.samples), own.points, max(1.0, 2.0 * GRID_MM), fit)
     fitting = float(np.mean(fit.weights > 0.1))
     found = f"{100 * support:.0f} % of its visible surface found, {100 * fitting:.0f} % of the points there fit it"
-    if fit.sigma_mm > o.max_noise_mm or (support < o.min_support and fitting < o.min_fitting):
+    if fit.sigma_mm > MAX_NOISE_MM or (support < MIN_SUPPORT and fitting < MIN_FITTING):
         reason = (
             "what stands there does not have its shape: fallen over, bent, another component, or badly reconstructed"
         )
         return NotMeasured(name, "cloud", f"{reason} ({found}, residuals {fit.sigma_mm:.2f} mm)")
-    if support < o.min_support:
+    if support < MIN_SUPPORT:
         return NotMeasured(name, "cloud", f"too little of it is where it should be: fallen over, or hidden ({found})")
-    return _move(c, fit, support, o)
+    return _move(c, fit, support)
 
 
-def _by_icp(
-    found: Move | NotMeasured, c: CloudComponent, cloud: CloudPoints, o: CloudDeviationOptions
-) -> Move | NotMeasured:
-    """The same component placed by the classical ICP."""
-    if not isinstance(found, Move):
-        return found
-    own = _crop(c, cloud, o)[1]
-    samples, faces = c.surface.sample(max(0.5 * o.icp.grid_mm, 0.2))
-    usable = c.usable_faces[faces]
-    try:
-        return icp_move(
-            found,
-            own.points,
-            samples[usable],
-            c.surface.face_normals[faces[usable]],
-            c.component.bounds_in_model,
-            o.icp,
-        )
-    except InputError as error:
-        return NotMeasured(c.component.name, "cloud", str(error).removeprefix("registration: "))
-
-
-def _crop(c: CloudComponent, cloud: CloudPoints, o: CloudDeviationOptions) -> tuple[CloudPoints, CloudPoints]:
+def crop_component(c: CloudComponent, cloud: CloudPoints) -> tuple[CloudPoints, CloudPoints]:
     """Points around the component, and those of them that may belong to it."""
-    low, high = c.component.bounds_in_model[0] - o.band_mm, c.component.bounds_in_model[1] + o.band_mm
+    low, high = c.component.bounds_in_model[0] - BAND_MM, c.component.bounds_in_model[1] + BAND_MM
     near = cloud.only(np.all((cloud.points >= low) & (cloud.points <= high), axis=1))
-    is_own = c.surface.closest(near.points, o.band_mm).faces >= 0
+    is_own = c.surface.closest(near.points, BAND_MM).faces >= 0
     if c.others is not None:
         is_own &= c.others.closest(near.points, c.joint_mm).faces < 0
     return near, near.only(is_own)
 
 
-def _missing(c: CloudComponent, near: CloudPoints, own: CloudPoints, o: CloudDeviationOptions) -> NotMeasured | None:
+def _missing(c: CloudComponent, near: CloudPoints, own: CloudPoints) -> NotMeasured | None:
     """The finding that the component is missing, or not covered, if hardly any point is near its place; else None."""
-    if _covered(c.samples, own.points, o.band_mm) >= o.missing_share and len(own) >= o.min_points // 3:
+    if _covered(c.samples, own.points, BAND_MM) >= MISSING_SHARE and len(own) >= MIN_POINTS // 3:
         return None
     name = c.component.name
     # The surfaces of others on which it stands are only visible when it is absent.
-    behind = _covered(c.contact, near.points, max(1.0, 2.0 * o.grid_mm)) if len(c.contact) else 0.0
+    behind = _covered(c.contact, near.points, max(1.0, 2.0 * GRID_MM)) if len(c.contact) else 0.0
     if behind > 0.4:
         return NotMeasured(
-            name, "cloud", f"missing: no surface where it should be, and {100 * behind:.0f} % of what it would cover "
-            "is seen", is_missing=True,
-        )  # fmt: skip
+            name,
+            "cloud",
+            f"missing: no surface where it should be, and {100 * behind:.0f} % of what it would cover is seen",
+            is_missing=True,
+        )
     return NotMeasured(name, "cloud", f"not covered by the cloud: {len(own)} points near its place")
 
 
@@ -374,21 +322,27 @@ def _covered(samples: Array, points: Array, reach_mm: float, fit: Registration |
     return float(np.mean(np.isfinite(distance)))
 
 
-def _register(c: CloudComponent, own: CloudPoints, start: Array | None, o: CloudDeviationOptions) -> Registration:
+def _register(c: CloudComponent, own: CloudPoints, start: Array | None) -> Registration:
     """Register the component's points to its surface, excluding undetermined directions one after the other."""
     radius, scales = c.radius_mm, np.array([c.radius_mm] * 3 + [1.0] * 3)
-    options = replace(o.registration, first_distance_mm=o.band_mm, min_points=min(o.min_points, 50))
+    options = replace(REGISTRATION, first_distance_mm=BAND_MM, min_points=min(MIN_POINTS, 50))
     given: dict[str, Any] = {"center": c.center, "radius_mm": radius, "usable_faces": c.usable_faces}
     fixed = c.spins
-    starts = _starts(c.center, radius, o.band_mm) if start is None else [start]
+    starts = _starts(c.center, radius, BAND_MM) if start is None else [start]
     for _ in range(6):
         free = _orthogonal_complement(fixed) / scales
         fit = register_from_starts(
-            own.points, c.surface, starts, normals=own.normals, point_weights=1.0 / own.sigma**2, options=options,
-            free=free, **given,
-        )  # fmt: skip
+            own.points,
+            c.surface,
+            starts,
+            normals=own.normals,
+            point_weights=1.0 / own.sigma**2,
+            options=options,
+            free=free,
+            **given,
+        )
         values, vectors = np.linalg.eigh(fit.covariance * np.outer(scales, scales))
-        loose = vectors[:, values > o.max_std_mm**2].T
+        loose = vectors[:, values > MAX_STD_MM**2].T
         unknown = np.concatenate([fit.undetermined, loose])
         if len(unknown) == 0:
             break
@@ -396,11 +350,17 @@ def _register(c: CloudComponent, own: CloudPoints, start: Array | None, o: Cloud
         if len(fixed) >= 6:
             raise InputError("registration: the points determine no move of it")
     # The influence of the kernel's width on the result is part of its uncertainty.
-    wide = replace(options, min_width_mm=o.doubt_width_mm, noise_points=0)
+    wide = replace(options, min_width_mm=DOUBT_WIDTH_MM, noise_points=0)
     other = register_to_surface(
-        own.points, c.surface, fit.surface_from_points, normals=own.normals, point_weights=1.0 / own.sigma**2,
-        options=wide, free=free, **given,
-    )  # fmt: skip
+        own.points,
+        c.surface,
+        fit.surface_from_points,
+        normals=own.normals,
+        point_weights=1.0 / own.sigma**2,
+        options=wide,
+        free=free,
+        **given,
+    )
     doubt = other.twist - fit.twist
     return replace(fit, covariance=fit.covariance + np.outer(doubt, doubt))
 
@@ -424,7 +384,7 @@ def _orthogonal_complement(fixed: Array) -> Array:
     return vectors[int(np.count_nonzero(values > 1e-6)) :]
 
 
-def _move(c: CloudComponent, fit: Registration, support: float, o: CloudDeviationOptions) -> Move:
+def _move(c: CloudComponent, fit: Registration, support: float) -> Move:
     """The registration as a move, with notes about what may be wrong."""
     scales = np.array([c.radius_mm] * 3 + [1.0] * 3)
     undetermined = _orthogonal_complement(fit.free)
@@ -434,26 +394,36 @@ def _move(c: CloudComponent, fit: Registration, support: float, o: CloudDeviatio
     notes = []
     if not fit.converged:
         notes.append(f"did not converge in {fit.iterations} iterations")
-    if fit.runner_up is not None and fit.runner_up_cost is not None and fit.runner_up_cost < o.rival_cost:
+    if fit.runner_up is not None and fit.runner_up_cost is not None and fit.runner_up_cost < RIVAL_COST:
         # Minima that differ along what is undetermined only, such as the turn of a round post, are one.
         other = determined @ (twist_about(c.center, invert(fit.runner_up)) * scales) - twist * scales
-        if np.linalg.norm(other) > o.rival_mm:
+        if np.linalg.norm(other) > RIVAL_MM:
             notes.append(f"fits nearly as well {np.linalg.norm(other):.2f} mm away (cost × {fit.runner_up_cost:.2f})")
-    if np.linalg.norm(twist[3:]) > 0.9 * o.band_mm:
-        notes.append(f"at the limit of the searched band of {o.band_mm:g} mm")
+    if np.linalg.norm(twist[3:]) > 0.9 * BAND_MM:
+        notes.append(f"at the limit of the searched band of {BAND_MM:g} mm")
     if support < 0.6:
         notes.append(f"only {100 * support:.0f} % of its visible surface is in the cloud")
     return Move(
-        component=c.component.name, method="cloud", center_in_model=c.center, twist=twist, covariance=covariance,
-        undetermined=undetermined, radius_mm=c.radius_mm, used=int(np.count_nonzero(fit.weights > 0.1)),
-        residual_mm=fit.sigma_mm, support=support, notes=tuple(notes),
-    )  # fmt: skip
+        component=c.component.name,
+        method="cloud",
+        center_in_model=c.center,
+        twist=twist,
+        covariance=covariance,
+        undetermined=undetermined,
+        radius_mm=c.radius_mm,
+        used=int(np.count_nonzero(fit.weights > 0.1)),
+        residual_mm=fit.sigma_mm,
+        support=support,
+        notes=tuple(notes),
+    )
 
 
 def _with_swapped_name(
-    found: Move | NotMeasured, c: CloudComponent, all_of_them: Sequence[CloudComponent], cloud: CloudPoints,
-    o: CloudDeviationOptions,
-) -> Move | NotMeasured:  # fmt: skip
+    found: Move | NotMeasured,
+    c: CloudComponent,
+    all_of_them: Sequence[CloudComponent],
+    cloud: CloudPoints,
+) -> Move | NotMeasured:
     """Add to a component that did not fit the name of another one whose shape does: the two may be swapped."""
     if isinstance(found, Move) or found.is_missing or "shape" not in found.reason or c.others is None:
         return found
@@ -466,11 +436,14 @@ def _with_swapped_name(
         there = rigid(np.eye(3), foot - other.others.closest(other.center[None]).points[0])
         vertices = apply(there, other.component.vertices_in_model)
         trial = replace(
-            other, component=Component(c.component.name, vertices, other.component.faces), others=c.others,
-            surface=MeshSurface(vertices, other.component.faces), samples=apply(there, other.samples),
+            other,
+            component=Component(c.component.name, vertices, other.component.faces),
+            others=c.others,
+            surface=MeshSurface(vertices, other.component.faces),
+            samples=apply(there, other.samples),
             contact=apply(there, other.contact),
-        )  # fmt: skip
-        if isinstance(_measure(trial, cloud, np.eye(4), o), Move):
+        )
+        if isinstance(_measure(trial, cloud, np.eye(4)), Move):
             return replace(found, reason=f"{found.reason}; it has the shape of {other.component.name}: swapped?")
     return found
 

@@ -125,9 +125,11 @@ def histogram_picture(distances: DistanceMap, model: Model, component: str | Non
     row = next((item for item in distances.statistics if item.name == name), None)
     if row is None:
         raise InputError(f"distance map: no points of {name!r}")
-    mine = np.ones(len(distances.distances), bool) if component is None else (
-        distances.components == model.index(component)
-    )  # fmt: skip
+    mine = (
+        np.ones(len(distances.distances), bool)
+        if component is None
+        else (distances.components == model.index(component))
+    )
     span = min(distances.reach_mm, max(6.0 * row.fwhm_mm, 0.05))
     edges = np.linspace(row.median_mm - span, row.median_mm + span, 81)
     count, _ = np.histogram(distances.distances[mine], edges)
@@ -138,9 +140,12 @@ def histogram_picture(distances: DistanceMap, model: Model, component: str | Non
 
 
 def map_picture(
-    distances: DistanceMap, direction: tuple[float, float, float] = (0.6, -0.8, 1.0), limit_mm: float = 1.0,
-    width: int = 1200, height: int = 900,
-) -> Picture:  # fmt: skip
+    distances: DistanceMap,
+    direction: tuple[float, float, float] = (0.6, -0.8, 1.0),
+    limit_mm: float = 1.0,
+    width: int = 1200,
+    height: int = 900,
+) -> Picture:
     """The points in their colours in parallel projection from a direction, with a scale, as (H,W,3) uint8 RGB."""
     points = distances.points_in_model
     middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
@@ -171,9 +176,13 @@ def map_picture(
 def _statistics(name: str, distances: Array, reach_mm: float) -> DistanceStatistics:
     """Statistics of some distances."""
     return DistanceStatistics(
-        name, len(distances), float(distances.mean()), float(distances.std()), float(np.median(distances)),
+        name,
+        len(distances),
+        float(distances.mean()),
+        float(distances.std()),
+        float(np.median(distances)),
         full_width_at_half_maximum(distances, reach_mm),
-    )  # fmt: skip
+    )
 
 
 def full_width_at_half_maximum(values: Array, reach: float) -> float:

@@ -13,22 +13,14 @@ from arview.measurement.cloud.mesh_surface import MeshSurface
 from arview.measurement.cloud.points import prepare_cloud
 from arview.reconstruction.types import DenseCloud
 
-
-@dataclass(frozen=True)
-class ForeignOptions:
-    """Options of the search.
-
-    Attributes:
-        far_mm: points nearer to the CAD, with components at their measured places, belong to it or to a weld.
-        cell_mm: points in touching cells of this size form one object.
-        min_area_mm2: smaller objects are spatter or wrong points.
-        grid_mm: of the averaging, see `CloudDeviationOptions`.
-    """
-
-    far_mm: float = 4.0
-    cell_mm: float = 2.0
-    min_area_mm2: float = 40.0
-    grid_mm: float = 0.5
+FAR_MM = 4.0
+"""Points nearer to the CAD, with components at their measured places, belong to it or to a weld."""
+CELL_MM = 2.0
+"""Points in touching cells of this size form one object."""
+MIN_AREA_MM2 = 40.0
+"""Smaller objects are spatter or wrong points."""
+GRID_MM = 0.5
+"""Cell of the grid on which the cloud is averaged."""
 
 
 @dataclass(frozen=True)
@@ -59,9 +51,11 @@ class ForeignObject:
 
 
 def find_foreign(
-    cloud: DenseCloud, model: Model, places: Mapping[str, Array] | None = None, unknown: Sequence[str] = (),
-    options: ForeignOptions | None = None,
-) -> list[ForeignObject]:  # fmt: skip
+    cloud: DenseCloud,
+    model: Model,
+    places: Mapping[str, Array] | None = None,
+    unknown: Sequence[str] = (),
+) -> list[ForeignObject]:
     """Find objects inside the model's bounding box that are far from all of its surfaces, largest first.
 
     Args:
@@ -69,28 +63,26 @@ def find_foreign(
         model: the nominal CAD.
         places: (4,4) ``measured_from_nominal`` by component, so that displaced components are not foreign objects.
         unknown: components that are present but could not be measured; their surroundings are ignored.
-        options: see `ForeignOptions`.
 
     Raises:
         InputError: the cloud has no points in the box.
     """
     from scipy.ndimage import label
 
-    o = options or ForeignOptions()
     # The borders of the box are left out: what lies below and around the part appears there.
-    points = prepare_cloud(cloud, model.bounds_in_model + np.array([[o.far_mm], [-o.far_mm]]), o.grid_mm, 1).points
+    points = prepare_cloud(cloud, model.bounds_in_model + np.array([[FAR_MM], [-FAR_MM]]), GRID_MM, 1).points
     places = places or {}
     _, faces, groups = model.mesh
     parts = [apply(places.get(c.name, np.eye(4)), c.vertices_in_model) for c in model.components]
     surface = MeshSurface(np.concatenate(parts), faces, groups)
-    far = points[surface.closest(points, o.far_mm).faces < 0]
+    far = points[surface.closest(points, FAR_MM).faces < 0]
     for name in unknown:
         low, high = model.component(name).bounds_in_model
         reach = float(np.linalg.norm(high - low))
         far = far[~np.all((far > low - reach) & (far < high + reach), axis=1)]
     if len(far) == 0:
         return []
-    cell_mm = max(o.cell_mm, model.diameter_mm / 400.0)
+    cell_mm = max(CELL_MM, model.diameter_mm / 400.0)
     cell = np.floor((far - far.min(axis=0)) / cell_mm).astype(np.int64)
     filled = np.zeros(cell.max(axis=0) + 1, dtype=bool)
     filled[tuple(cell.T)] = True
@@ -99,8 +91,8 @@ def find_foreign(
     found = []
     for index in range(1, count + 1):
         mine = far[owner == index]
-        area = len(mine) * o.grid_mm**2
-        if area < o.min_area_mm2:
+        area = len(mine) * GRID_MM**2
+        if area < MIN_AREA_MM2:
             continue
         closest = surface.closest(mine)
         farthest = int(np.argmax(np.abs(closest.distances)))

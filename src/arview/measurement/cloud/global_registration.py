@@ -8,8 +8,6 @@ not the components.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from scipy.spatial import cKDTree
 
@@ -23,25 +21,26 @@ from arview.measurement.cloud.registration import TUKEY_SIGMAS
 from arview.reconstruction.scale.similarity import Similarity
 from arview.reconstruction.types import DenseCloud
 
+POINTS = 4000
+"""Of cloud and CAD each; a few for each voxel."""
+VOXELS = 40
+"""Across the diameter: components are some voxels wide."""
+STEP_DEG = 6.0
+"""Between rotations about a principal direction; refinement converges from half of it."""
+KEPT = 12
+"""Poses that are refined and compared."""
+SCALE_STEP = 1.08
+"""Ratio of scales that are tried when the scale is unknown."""
+SCALE_RANGE = (0.7, 2.5)
+"""Size of the part over the cloud's; above 1, part of it is unseen."""
+LIMIT_SHARE = 0.015
+"""Distances are limited to this share of the diameter."""
+MIN_LEAD = 1.08
+"""Cost of the next best pose over the best one's, below which it is ambiguous."""
+SEED = 0
 
-@dataclass(frozen=True)
-class GlobalRegistrationOptions:
-    """Options of the search. ``diameter`` is the model's."""
 
-    points: int = 4000  # of cloud and CAD each; a few for each voxel
-    voxels: int = 40  # across the diameter: components are some voxels wide
-    step_deg: float = 6.0  # between rotations about a principal direction; refinement converges from half of it
-    kept: int = 12  # poses that are refined and compared
-    scale_step: float = 1.08  # ratio of scales that are tried when the scale is unknown
-    scale_range: tuple[float, float] = (0.7, 2.5)  # size of the part over the cloud's; above 1, part of it is unseen
-    limit_share: float = 0.015  # distances are limited to this share of the diameter
-    min_lead: float = 1.08  # cost of the next best pose over the best one's, below which it is ambiguous
-    seed: int = 0
-
-
-def find_model_in_cloud(
-    cloud: DenseCloud, model: Model, scale: float | None = 1.0, options: GlobalRegistrationOptions | None = None
-) -> Similarity:
+def find_model_in_cloud(cloud: DenseCloud, model: Model, scale: float | None = 1.0) -> Similarity:
     """Scale and rigid pose ``model_from_scan`` of the model in a cloud.
 
     With a known scale the search goes by pairs of points (`pair_registration`), which finds a quarter of the part among
@@ -51,34 +50,30 @@ def find_model_in_cloud(
         cloud: of the part.
         model: the nominal CAD.
         scale: mm per unit of the cloud, None when unknown.
-        options: see `GlobalRegistrationOptions`.
 
     Raises:
         InputError: there are too few points, none fits, or two poses fit alike that are not related by a symmetry.
     """
-    o = options or GlobalRegistrationOptions()
     if scale:
         own = np.asarray(cloud.points, dtype=np.float64) * scale
         sound = np.isfinite(own).all(axis=1)
         sides = np.nan_to_num(np.asarray(cloud.normals[sound], dtype=np.float64)) if cloud.normals.any() else None
         return Similarity(scale, find_by_pairs(own[sound], sides, model).model_from_scan)
-    points, normals, is_oriented = _some_points(cloud, o)
+    points, normals, is_oriented = _some_points(cloud)
     vertices, faces, groups = model.mesh
     surface = MeshSurface(vertices, faces, groups)
-    samples, of_face = surface.spread(o.points, o.seed)
+    samples, of_face = surface.spread(POINTS, SEED)
     extent = float(np.linalg.norm(np.diff(np.quantile(points, [0.01, 0.99], axis=0), axis=0)))
-    scales = list(_ladder(model.diameter_mm / extent, o))
-    turns = _turns(normals, surface.face_normals[of_face], o)
+    scales = list(_ladder(model.diameter_mm / extent))
+    turns = _turns(normals, surface.face_normals[of_face])
     places = [
-        job
-        for one in scales
-        for job in pool().map(lambda r, s=one: _shifted(points * s, samples, r, model, s, o), turns)
+        job for one in scales for job in pool().map(lambda r, s=one: _shifted(points * s, samples, r, model, s), turns)
     ]
     places.sort(key=lambda place: -place[0])
-    limit_mm = o.limit_share * model.diameter_mm
+    limit_mm = LIMIT_SHARE * model.diameter_mm
     # A thin plate also fits with its top on its bottom, so there are starts displaced to both sides.
-    step = 0.8 * model.diameter_mm / o.voxels * _main_axes(surface.face_normals[of_face], 1)[0]
-    tried = [(s, rigid(np.eye(3), k * step) @ pose) for _, s, pose in _separated(places, o) for k in (-1.0, 0.0, 1.0)]
+    step = 0.8 * model.diameter_mm / VOXELS * _main_axes(surface.face_normals[of_face], 1)[0]
+    tried = [(s, rigid(np.eye(3), k * step) @ pose) for _, s, pose in _separated(places) for k in (-1.0, 0.0, 1.0)]
     sides = normals if is_oriented else None
     fits = list(pool().map(lambda job: _refined(points, sides, surface, samples, job, True, limit_mm), tried))
     fits.sort(key=lambda fit: fit[0])
@@ -88,7 +83,7 @@ def find_model_in_cloud(
     if around > 0.7 or cost > 0.6 * limit_mm * (1.0 - around):
         raise InputError("cloud: the part was not found in it: another part, or too little of it")
     for rival_cost, _, rival in fits[1:]:
-        if rival_cost - around * limit_mm > o.min_lead * cost + 1e-3 * limit_mm:
+        if rival_cost - around * limit_mm > MIN_LEAD * cost + 1e-3 * limit_mm:
             break
         moved = apply(rival @ invert(pose), samples)
         other_mm = np.abs(surface.closest(moved).distances)
@@ -100,16 +95,16 @@ def find_model_in_cloud(
     return Similarity(found_scale, pose)
 
 
-def _some_points(cloud: DenseCloud, o: GlobalRegistrationOptions) -> tuple[Array, Array, bool]:
+def _some_points(cloud: DenseCloud) -> tuple[Array, Array, bool]:
     """Points (N,3) spread evenly over a cloud, their normals, and whether these are oriented (else estimated)."""
     points, own = np.asarray(cloud.points, dtype=np.float64), np.asarray(cloud.normals, dtype=np.float64)
     sound = np.isfinite(points).all(axis=1)
     points, own = points[sound], np.nan_to_num(own[sound])
     if len(points) < 200:
         raise InputError(f"cloud: {len(points)} points are too few to find the part in it; at least 200 are needed")
-    rng = np.random.default_rng(o.seed)
-    if len(points) > 40 * o.points:
-        few = rng.permutation(len(points))[: 40 * o.points]
+    rng = np.random.default_rng(SEED)
+    if len(points) > 40 * POINTS:
+        few = rng.permutation(len(points))[: 40 * POINTS]
         points, own = points[few], own[few]
     low, high = np.quantile(points, [0.002, 0.998], axis=0)
     core = np.all((points >= low - 0.05 * (high - low)) & (points <= high + 0.05 * (high - low)), axis=1)
@@ -118,7 +113,7 @@ def _some_points(cloud: DenseCloud, o: GlobalRegistrationOptions) -> tuple[Array
     cell = float(np.linalg.norm(high - low)) / 20.0
     for _ in range(12):
         _, first = np.unique(np.floor(points / cell).astype(np.int64), axis=0, return_index=True)
-        if len(first) >= 0.7 * o.points or len(first) > 0.5 * len(points):
+        if len(first) >= 0.7 * POINTS or len(first) > 0.5 * len(points):
             break
         cell *= 0.8
     chosen = points[first]
@@ -130,10 +125,10 @@ def _some_points(cloud: DenseCloud, o: GlobalRegistrationOptions) -> tuple[Array
     return chosen, vectors[:, :, 0], False
 
 
-def _ladder(middle: float, o: GlobalRegistrationOptions) -> Array:
+def _ladder(middle: float) -> Array:
     """Scales to try around a middle one, in geometric steps."""
-    low, high = o.scale_range
-    return np.asarray(middle * np.geomspace(low, high, int(np.log(high / low) / np.log(o.scale_step)) + 2))
+    low, high = SCALE_RANGE
+    return np.asarray(middle * np.geomspace(low, high, int(np.log(high / low) / np.log(SCALE_STEP)) + 2))
 
 
 def _main_axes(normals: Array, max_count: int) -> list[Array]:
@@ -153,10 +148,10 @@ def _main_axes(normals: Array, max_count: int) -> list[Array]:
     return found or [np.array([0.0, 0.0, 1.0])]
 
 
-def _turns(of_cloud: Array, of_model: Array, o: GlobalRegistrationOptions) -> list[Array]:
+def _turns(of_cloud: Array, of_model: Array) -> list[Array]:
     """Rotations (3,3) that turn the cloud's main direction onto one of the model's, either side up, all around it."""
     turns = []
-    angles = np.arange(0.0, 360.0, o.step_deg)
+    angles = np.arange(0.0, 360.0, STEP_DEG)
     for target in _main_axes(of_model, 2):
         for sign in (1.0, -1.0):
             first = _between(sign * _main_axes(of_cloud, 1)[0], target)
@@ -173,14 +168,12 @@ def _between(a: Array, b: Array) -> Array:
     return exp_so3(axis / np.linalg.norm(axis) * np.arctan2(np.linalg.norm(axis), cosine))
 
 
-def _shifted(
-    points: Array, samples: Array, turn: Array, model: Model, scale: float, o: GlobalRegistrationOptions
-) -> tuple[float, float, Array]:
+def _shifted(points: Array, samples: Array, turn: Array, model: Model, scale: float) -> tuple[float, float, Array]:
     """Best translation of rotated points: normalised score, scale, and pose (4,4) of the scaled points."""
     from scipy import fft
 
     turned = points @ turn.T
-    cell = max(model.diameter_mm / o.voxels, float(np.ptp(turned, axis=0).max()) / 90.0)
+    cell = max(model.diameter_mm / VOXELS, float(np.ptp(turned, axis=0).max()) / 90.0)
     of_points, low = _voxels(turned, cell)
     of_model, low_model = _voxels(samples, cell)
     shape = [fft.next_fast_len(a + b, real=True) for a, b in zip(of_points.shape, of_model.shape, strict=True)]
@@ -204,24 +197,27 @@ def _voxels(points: Array, cell: float) -> tuple[Array, Array]:
     return gaussian_filter(grid, 0.8), low
 
 
-def _separated(
-    places: list[tuple[float, float, Array]], o: GlobalRegistrationOptions
-) -> list[tuple[float, float, Array]]:
+def _separated(places: list[tuple[float, float, Array]]) -> list[tuple[float, float, Array]]:
     """The best poses, without those close to a better one."""
     kept: list[tuple[float, float, Array]] = []
     for score, scale, pose in places:
         turns = [np.trace(other[:3, :3].T @ pose[:3, :3]) for _, s, other in kept if abs(s / scale - 1.0) < 0.04]
-        if all(turn < 1.0 + 2.0 * np.cos(np.deg2rad(2.5 * o.step_deg)) for turn in turns):
+        if all(turn < 1.0 + 2.0 * np.cos(np.deg2rad(2.5 * STEP_DEG)) for turn in turns):
             kept.append((score, scale, pose))
-        if len(kept) == o.kept:
+        if len(kept) == KEPT:
             break
     return kept
 
 
 def _refined(
-    points: Array, normals: Array | None, surface: MeshSurface, samples: Array, start: tuple[float, Array],
-    with_scale: bool, limit_mm: float,
-) -> tuple[float, float, Array]:  # fmt: skip
+    points: Array,
+    normals: Array | None,
+    surface: MeshSurface,
+    samples: Array,
+    start: tuple[float, Array],
+    with_scale: bool,
+    limit_mm: float,
+) -> tuple[float, float, Array]:
     """Cost, scale and pose (4,4) on the exact surface: Gauss–Newton on up to seven parameters with Tukey's weights."""
     scale, pose = start
     width, size = 4.0 * limit_mm, 0.25 * float(np.linalg.norm(np.ptp(samples, axis=0)))

@@ -105,10 +105,25 @@ class MeshSurface:
         def work(start: int) -> None:
             part = slice(start, start + _CHUNK)
             _query(
-                points[part], hints[part], reach * reach, self._triangles, self._sides, self._is_edge,
-                self._corner_normals, self._low, self._high, self._right, self._start, self._count, self._order,
-                out.points[part], out.faces[part], out.distances[part], out.normals[part], out.is_edge[part],
-            )  # fmt: skip
+                points[part],
+                hints[part],
+                reach * reach,
+                triangles=self._triangles,
+                sides=self._sides,
+                edges=self._is_edge,
+                corner_normals=self._corner_normals,
+                low=self._low,
+                high=self._high,
+                right=self._right,
+                start=self._start,
+                count=self._count,
+                order=self._order,
+                out_points=out.points[part],
+                out_faces=out.faces[part],
+                out_distances=out.distances[part],
+                out_normals=out.normals[part],
+                out_edges=out.is_edge[part],
+            )
 
         starts = range(0, count, _CHUNK)
         if count > 2 * _CHUNK:
@@ -142,8 +157,9 @@ class MeshSurface:
         """
         # Files often repeat vertices for each face; coinciding vertices of two components stay separate.
         _, same = np.unique(np.round(self.vertices / _WELD_MM).astype(np.int64), axis=0, return_inverse=True)
-        _, corner = np.unique(same.ravel()[self.faces] * (self.groups.max() + 1) + self.groups[:, None],
-                              return_inverse=True)  # fmt: skip
+        _, corner = np.unique(
+            same.ravel()[self.faces] * (self.groups.max() + 1) + self.groups[:, None], return_inverse=True
+        )
         corner = corner.reshape(-1, 3)
         normals = self.face_normals
         sums, angles = np.zeros((corner.max() + 1, 3)), np.zeros(corner.shape)
@@ -182,9 +198,13 @@ def _pool() -> ThreadPoolExecutor:
 
 @kernel
 def _smooth(
-    corner: NDArray[np.int64], normals: NDArray[np.float64], angles: NDArray[np.float64],
-    faces_around: NDArray[np.int64], ends: NDArray[np.int64], min_cosine: float
-) -> NDArray[np.float64]:  # fmt: skip
+    corner: NDArray[np.int64],
+    normals: NDArray[np.float64],
+    angles: NDArray[np.float64],
+    faces_around: NDArray[np.int64],
+    ends: NDArray[np.int64],
+    min_cosine: float,
+) -> NDArray[np.float64]:
     """(F,3,3) normals at the corners of faces, averaged over adjacent faces that meet the face at a small angle."""
     out = np.zeros((len(corner), 3, 3))
     for face in range(len(corner)):
@@ -203,10 +223,16 @@ def _smooth(
 
 @kernel
 def _build(
-    middles: NDArray[np.float64], lows: NDArray[np.float64], highs: NDArray[np.float64], order: NDArray[np.int64],
-    low: NDArray[np.float64], high: NDArray[np.float64], right: NDArray[np.int64], start: NDArray[np.int64],
-    count: NDArray[np.int64]
-) -> int:  # fmt: skip
+    middles: NDArray[np.float64],
+    lows: NDArray[np.float64],
+    highs: NDArray[np.float64],
+    order: NDArray[np.int64],
+    low: NDArray[np.float64],
+    high: NDArray[np.float64],
+    right: NDArray[np.int64],
+    start: NDArray[np.int64],
+    count: NDArray[np.int64],
+) -> int:
     """Boxes of a tree in depth-first order, the left child right after its parent; returns their number."""
     stack = np.empty((128, 3), dtype=np.int64)
     stack[0] = 0, len(order), -1
@@ -259,7 +285,9 @@ def _tree(triangles: Array, used: NDArray[np.int64]) -> tuple[NDArray, ...]:  # 
     order, size = used.copy(), 2 * len(used)
     low, high = np.empty((size, 3)), np.empty((size, 3))
     right, start, count = (np.empty(size, dtype=np.int64) for _ in range(3))
-    nodes = _build(triangles.mean(axis=1), lows, highs, order, low, high, right, start, count)
+    nodes = _build(
+        triangles.mean(axis=1), lows, highs, order=order, low=low, high=high, right=right, start=start, count=count
+    )
     return order, low[:nodes].copy(), high[:nodes].copy(), right[:nodes], start[:nodes], count[:nodes]
 
 

@@ -14,10 +14,14 @@ from arview.core.kernel import kernel
 
 @kernel
 def hypotheses(
-    scene: NDArray[np.float64], scene_normals: NDArray[np.float64], pairs: NDArray[np.int64],
-    model: NDArray[np.float64], model_normals: NDArray[np.float64], matches: NDArray[np.int64],
-    min_cosine: float
-) -> NDArray[np.float64]:  # fmt: skip
+    scene: NDArray[np.float64],
+    scene_normals: NDArray[np.float64],
+    pairs: NDArray[np.int64],
+    model: NDArray[np.float64],
+    model_normals: NDArray[np.float64],
+    matches: NDArray[np.int64],
+    min_cosine: float,
+) -> NDArray[np.float64]:
     """(K,12) poses that put pairs of scene points on pairs of model points, NaN where the connecting lines disagree.
 
     Args:
@@ -71,9 +75,14 @@ def _moved(pose: NDArray[np.float64], point: NDArray[np.float64]) -> tuple[float
 
 @kernel
 def _nearest_node(
-    x: float, y: float, z: float, nodes: NDArray[np.int32], field: NDArray[np.float32], low: NDArray[np.float64],
-    cell: float
-) -> tuple[int, float]:  # fmt: skip
+    x: float,
+    y: float,
+    z: float,
+    nodes: NDArray[np.int32],
+    field: NDArray[np.float32],
+    low: NDArray[np.float64],
+    cell: float,
+) -> tuple[int, float]:
     """Index into ``field`` of the node nearest to a place, and the signed distance there; -1 away from the surface.
 
     The distance of the node is carried to the place along the normal. Arguments are those of `scores`.
@@ -108,10 +117,19 @@ def _cosine(
 
 @kernel
 def scores(
-    poses: NDArray[np.float64], of_pose: NDArray[np.int64], lists: NDArray[np.int64], points: NDArray[np.float64],
-    normals: NDArray[np.float64], point_weights: NDArray[np.float64], nodes: NDArray[np.int32],
-    field: NDArray[np.float32], low: NDArray[np.float64], cell: float, reach: float, is_oriented: bool
-) -> NDArray[np.float64]:  # fmt: skip
+    poses: NDArray[np.float64],
+    of_pose: NDArray[np.int64],
+    lists: NDArray[np.int64],
+    points: NDArray[np.float64],
+    normals: NDArray[np.float64],
+    point_weights: NDArray[np.float64],
+    nodes: NDArray[np.int32],
+    field: NDArray[np.float32],
+    low: NDArray[np.float64],
+    cell: float,
+    reach: float,
+    is_oriented: bool,
+) -> NDArray[np.float64]:
     """(K,) scores of poses: weights of the points on the surface, less half of those inside of it.
 
     Args:
@@ -155,11 +173,20 @@ def scores(
 
 @kernel
 def refined(
-    poses: NDArray[np.float64], of_pose: NDArray[np.int64], lists: NDArray[np.int64], points: NDArray[np.float64],
-    normals: NDArray[np.float64], point_weights: NDArray[np.float64], nodes: NDArray[np.int32],
-    field: NDArray[np.float32], low: NDArray[np.float64], cell: float, reaches: NDArray[np.float64], size: float,
-    is_oriented: bool
-) -> NDArray[np.float64]:  # fmt: skip
+    poses: NDArray[np.float64],
+    of_pose: NDArray[np.int64],
+    lists: NDArray[np.int64],
+    points: NDArray[np.float64],
+    normals: NDArray[np.float64],
+    point_weights: NDArray[np.float64],
+    nodes: NDArray[np.int32],
+    field: NDArray[np.float32],
+    low: NDArray[np.float64],
+    cell: float,
+    reaches: NDArray[np.float64],
+    size: float,
+    is_oriented: bool,
+) -> NDArray[np.float64]:
     """(K,12) poses after Gauss-Newton steps on the distances in the field, one for each of the shrinking ``reaches``.
 
     The other arguments are those of `scores`; ``size`` converts rotations to the unit of the points.

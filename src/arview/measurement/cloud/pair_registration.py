@@ -9,7 +9,7 @@ speaks against a pose.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,36 +22,56 @@ from arview.geometry import Array, apply, invert, rigid
 from arview.measurement.cloud.mesh_surface import MeshSurface
 from arview.measurement.cloud.pair_kernels import hypotheses, refined, scores
 from arview.measurement.cloud.registration import RegistrationOptions, register_to_surface
-from arview.measurement.cloud.scene_points import ScenePointOptions, ScenePoints, plane_weights, scene_points
+from arview.measurement.cloud.scene_points import ScenePoints, plane_weights, scene_points
+
+MODEL_POINTS = 2400
+"""Points of the CAD whose pairs are matched."""
+FIRST_PAIRS = 7000
+"""The same in the first round, which finds what is the main thing in the cloud."""
+PROBES = 3
+"""Cells of the table in which each pair is looked up, because noise moves it between them."""
+MATCHES = 40
+"""Pairs of the CAD that are tried for each of them, at random if there are more."""
+PAIR_RANGE = (0.06, 0.55)
+"""Distance of the points of a pair."""
+DISTANCE_STEP = 0.03
+"""Step of the table of pairs for distances."""
+ANGLE_STEP_DEG = 12.0
+"""The same for angles."""
+PARALLEL_DEG = 25.0
+"""Normals at a smaller angle do not determine a pose."""
+FIELD_CELLS = 84
+"""Cells of the distance field across the diameter."""
+COARSE_REACH = 0.03
+"""Distance within which points support a hypothesis."""
+FINE_REACH = 0.008
+"""The same after refinement; components may be displaced by less."""
+SCORED = 160
+"""Points on which a hypothesis is scored."""
+REFINED = 4
+"""Hypotheses of each first point that are refined in the distance field."""
+KEPT = 28
+"""Poses that are refined on the exact surface and compared."""
+MIN_SHARE = 0.15
+"""Weighted share of the CAD that must be found in the cloud."""
+SURE_SHARE = 0.35
+"""With as much of it found, normals are not tried the other way round."""
+MAX_INSIDE = 0.25
+"""Share of the points near the CAD that may lie inside of it."""
+MIN_LEAD = 1.06
+"""Score over that of the next best pose, below which the place is ambiguous."""
+LIST_BLOCK = 2_000_000
+"""Distances between points that are kept in memory at a time."""
+ROUNDS = 4
+"""Searches with other pairs, until the part is found."""
+SEED = 0
 
 
 @dataclass(frozen=True)
 class PairRegistrationOptions:
     """Options of the search. Lengths are shares of the model's diameter unless named otherwise."""
 
-    model_points: int = 2400  # points of the CAD whose pairs are matched
-    first_pairs: int = 7000  # the same in the first round, which finds what is the main thing in the cloud
-    probes: int = 3  # cells of the table in which each pair is looked up, because noise moves it between them
     pairs: int = 24_000  # pairs of the cloud that are tried
-    matches: int = 40  # pairs of the CAD that are tried for each of them, at random if there are more
-    pair_range: tuple[float, float] = (0.06, 0.55)  # distance of the points of a pair
-    distance_step: float = 0.03  # step of the table of pairs for distances
-    angle_step_deg: float = 12.0  # the same for angles
-    parallel_deg: float = 25.0  # normals at a smaller angle do not determine a pose
-    field_cells: int = 84  # cells of the distance field across the diameter
-    coarse_reach: float = 0.03  # distance within which points support a hypothesis
-    fine_reach: float = 0.008  # the same after refinement; components may be displaced by less
-    scored: int = 160  # points on which a hypothesis is scored
-    refined: int = 4  # hypotheses of each first point that are refined in the distance field
-    kept: int = 28  # poses that are refined on the exact surface and compared
-    min_share: float = 0.15  # weighted share of the CAD that must be found in the cloud
-    sure_share: float = 0.35  # with as much of it found, normals are not tried the other way round
-    max_inside: float = 0.25  # share of the points near the CAD that may lie inside of it
-    min_lead: float = 1.06  # score over that of the next best pose, below which the place is ambiguous
-    scene: ScenePointOptions = field(default_factory=ScenePointOptions)  # preparation of the cloud
-    list_block: int = 2_000_000  # distances between points that are kept in memory at a time
-    rounds: int = 4  # searches with other pairs, until the part is found
-    seed: int = 0
 
 
 @dataclass(frozen=True)
@@ -102,15 +122,15 @@ def find_by_pairs(
         InputError: there are too few points, the part is not found, or two places fit alike that no symmetry relates.
     """
     o = options or PairRegistrationOptions()
-    target = _target(model, o)
-    scene = scene_points(points, normals, target.diameter_mm, o.scene)
+    target = _target(model)
+    scene = scene_points(points, normals, target.diameter_mm)
     found = candidates(scene, target, o)
-    if not found or found[0].score < o.min_share or found[0].inside > o.max_inside:
+    if not found or found[0].score < MIN_SHARE or found[0].inside > MAX_INSIDE:
         raise InputError("cloud: the part was not found in it: another part, or too little of it")
     best = found[0]
     limit_mm = 0.015 * target.diameter_mm
     for rival in found[1:]:
-        if rival.score * o.min_lead < best.score:
+        if rival.score * MIN_LEAD < best.score:
             break
         moved = apply(rival.model_from_scan @ invert(best.model_from_scan), target.samples)
         apart = np.linalg.norm(moved - target.samples, axis=1)
@@ -124,13 +144,13 @@ def find_by_pairs(
 
 def candidates(scene: ScenePoints, target: _Target, o: PairRegistrationOptions) -> list[PartPlacement]:
     """Different places of the CAD in the cloud, the best first."""
-    rng = np.random.default_rng(o.seed)
-    tables = _PairTable(target, o)
-    lists = _near_lists(scene, target.diameter_mm, o, rng)
+    rng = np.random.default_rng(SEED)
+    tables = _PairTable(target)
+    lists = _near_lists(scene, target.diameter_mm, rng)
     placements: list[PartPlacement] = []
     signs = (1.0, -1.0) if scene.is_oriented else (1.0,)
-    for turn, sign in enumerate(signs * o.rounds):
-        count = o.pairs if turn >= len(signs) else o.first_pairs
+    for turn, sign in enumerate(signs * ROUNDS):
+        count = o.pairs if turn >= len(signs) else FIRST_PAIRS
         pairs = _scene_pairs(scene, target, replace(o, pairs=count), rng)
         turned = sign * scene.normals
         chosen, matches = tables.lookup(scene.points, turned, pairs, rng, target.diameter_mm)
@@ -139,31 +159,31 @@ def candidates(scene: ScenePoints, target: _Target, o: PairRegistrationOptions) 
         )
         sound = np.isfinite(poses[:, 0])
         poses, start = poses[sound], chosen[sound, 0]
-        values = _scored(poses, start, lists[:, : o.scored], scene, turned, target, o.coarse_reach)
-        best = _best_of_each(values, start, o.refined)
-        better = _refine(poses[best], start[best], lists, scene, turned, target, o)
-        values = _scored(better, start[best], lists, scene, turned, target, o.fine_reach)
+        values = _scored(poses, start, lists[:, :SCORED], scene, turned, target, COARSE_REACH)
+        best = _best_of_each(values, start, REFINED)
+        better = _refine(poses[best], start[best], lists, scene, turned, target)
+        values = _scored(better, start[best], lists, scene, turned, target, FINE_REACH)
         order = np.argsort(-values)
-        kept = _different([(better[i], sign) for i in order[: 20 * o.kept]], target, o)
-        exact = pool().map(lambda one: _exact(one, scene, target, o), kept)
+        kept = _different([(better[i], sign) for i in order[: 20 * KEPT]], target)
+        exact = pool().map(lambda one: _exact(one, scene, target), kept)
         placements += [one for one in exact if one is not None]
         best_score = max((one.score for one in placements), default=0.0)
-        if best_score > (o.sure_share if sign > 0 and scene.is_oriented else o.min_share):
+        if best_score > (SURE_SHARE if sign > 0 and scene.is_oriented else MIN_SHARE):
             break
     return sorted(placements, key=lambda one: -one.score)
 
 
-def _target(model: Model, o: PairRegistrationOptions) -> _Target:
+def _target(model: Model) -> _Target:
     """Points, weights and distance field of a model."""
     from scipy.ndimage import distance_transform_edt
 
     vertices, faces, groups = model.mesh
     surface = MeshSurface(vertices, faces, groups)
     diameter = model.diameter_mm
-    samples, of_face = surface.spread(24_000, o.seed)
+    samples, of_face = surface.spread(24_000, SEED)
     normals = surface.face_normals[of_face]
-    cell = diameter / o.field_cells
-    margin = int(np.ceil(1.6 * o.coarse_reach * o.field_cells)) + 1
+    cell = diameter / FIELD_CELLS
+    margin = int(np.ceil(1.6 * COARSE_REACH * FIELD_CELLS)) + 1
     low = samples.min(axis=0) - margin * cell
     index = np.round((samples - low) / cell).astype(np.int64)
     occupied = np.ones(index.max(axis=0) + margin + 1, dtype=bool)
@@ -178,26 +198,34 @@ def _target(model: Model, o: PairRegistrationOptions) -> _Target:
     nodes[tuple(near.T)] = np.arange(len(near))
     field = np.column_stack([closest.distances, closest.normals, weight_of_face[closest.faces]]).astype(np.float32)
     # Components are small beside the base, but their pairs are those that tell where the part is.
-    rng = np.random.default_rng(o.seed)
+    rng = np.random.default_rng(SEED)
     share = np.sqrt(weights) / np.sqrt(weights).sum()
-    first = rng.choice(len(samples), size=min(o.model_points, len(samples) // 2), replace=False, p=share)
+    first = rng.choice(len(samples), size=min(MODEL_POINTS, len(samples) // 2), replace=False, p=share)
     return _Target(
-        surface, np.ascontiguousarray(samples[first]), np.ascontiguousarray(normals[first]), weights[first],
-        samples[::4], weights[::4] / weights[::4].sum(), diameter, nodes, field, low, cell,
-    )  # fmt: skip
+        surface,
+        np.ascontiguousarray(samples[first]),
+        np.ascontiguousarray(normals[first]),
+        weights=weights[first],
+        samples=samples[::4],
+        sample_weights=weights[::4] / weights[::4].sum(),
+        diameter_mm=diameter,
+        nodes=nodes,
+        field=field,
+        low=low,
+        cell=cell,
+    )
 
 
 class _PairTable:
     """Pairs of model points by distance and angles."""
 
-    def __init__(self, target: _Target, o: PairRegistrationOptions) -> None:
-        self._o = o
+    def __init__(self, target: _Target) -> None:
         count = len(target.points)
         first, second = np.divmod(np.arange(count * count), count)
         distance = np.linalg.norm(target.points[second] - target.points[first], axis=1) / target.diameter_mm
         cosine = np.sum(target.normals[first] * target.normals[second], axis=1)
-        used = (distance > o.pair_range[0]) & (distance < o.pair_range[1])
-        used &= np.abs(cosine) < np.cos(np.deg2rad(o.parallel_deg))
+        used = (distance > PAIR_RANGE[0]) & (distance < PAIR_RANGE[1])
+        used &= np.abs(cosine) < np.cos(np.deg2rad(PARALLEL_DEG))
         self._pairs = np.stack([first[used], second[used]], axis=1)
         keys = self._keys(target.points, target.normals, self._pairs, target.diameter_mm)
         order = np.argsort(keys, kind="stable")
@@ -207,19 +235,23 @@ class _PairTable:
         self, points: Array, normals: Array, pairs: NDArray[np.int64], rng: np.random.Generator, diameter_mm: float
     ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """(K,2) pairs of points, repeated for each of their matches, and the (K,2) matching model pairs."""
-        pairs = np.repeat(pairs, self._o.probes, axis=0)
+        pairs = np.repeat(pairs, PROBES, axis=0)
         keys = self._keys(points, normals, pairs, diameter_mm, rng)
         first = np.searchsorted(self._sorted, keys, "left")
         count = np.searchsorted(self._sorted, keys, "right") - first
-        taken = np.minimum(count, self._o.matches)
+        taken = np.minimum(count, MATCHES)
         of_pair = np.repeat(np.arange(len(pairs)), taken)
         at = np.floor(rng.random(len(of_pair)) * count[of_pair]).astype(np.int64)
         return pairs[of_pair], self._pairs[first[of_pair] + at]
 
     def _keys(
-        self, points: Array, normals: Array, pairs: NDArray[np.int64], diameter_mm: float,
+        self,
+        points: Array,
+        normals: Array,
+        pairs: NDArray[np.int64],
+        diameter_mm: float,
         rng: np.random.Generator | None = None,
-    ) -> NDArray[np.int64]:  # fmt: skip
+    ) -> NDArray[np.int64]:
         """(K,) cell of each pair: distance, both angles with the connecting line, angle of the normals.
 
         With ``rng`` each value is moved at random by up to half a cell.
@@ -229,15 +261,14 @@ class _PairTable:
             moved = values + 0.5 if rng is None else values + rng.random(len(values))
             return np.maximum(np.floor(moved), 0.0).astype(np.int64)
 
-        o = self._o
         along = points[pairs[:, 1]] - points[pairs[:, 0]]
         length = np.linalg.norm(along, axis=1)
         along = along / np.maximum(length, 1e-9)[:, None]
         a, b = normals[pairs[:, 0]], normals[pairs[:, 1]]
-        key = cells(length / (diameter_mm * o.distance_step))
+        key = cells(length / (diameter_mm * DISTANCE_STEP))
         for cosine in (np.sum(a * along, axis=1), np.sum(b * along, axis=1), np.sum(a * b, axis=1)):
             angle = np.rad2deg(np.arccos(np.clip(cosine, -1.0, 1.0)))
-            key = key * 64 + cells(angle / o.angle_step_deg)
+            key = key * 64 + cells(angle / ANGLE_STEP_DEG)
         return key
 
 
@@ -250,10 +281,10 @@ def _scene_pairs(
     firsts = rng.choice(len(scene.points), size=min(o.pairs // 12 + 1, 3 * len(scene.points)), p=share)
     found = []
     for first in firsts:
-        near = np.array(tree.query_ball_point(scene.points[first], o.pair_range[1] * target.diameter_mm))
+        near = np.array(tree.query_ball_point(scene.points[first], PAIR_RANGE[1] * target.diameter_mm))
         cosine = scene.normals[near] @ scene.normals[first]
-        far = np.linalg.norm(scene.points[near] - scene.points[first], axis=1) > o.pair_range[0] * target.diameter_mm
-        near = near[far & (np.abs(cosine) < np.cos(np.deg2rad(o.parallel_deg)))]
+        far = np.linalg.norm(scene.points[near] - scene.points[first], axis=1) > PAIR_RANGE[0] * target.diameter_mm
+        near = near[far & (np.abs(cosine) < np.cos(np.deg2rad(PARALLEL_DEG)))]
         if len(near) == 0:
             continue
         weights = scene.weights[near] / scene.weights[near].sum()
@@ -275,18 +306,16 @@ def _best_of_each(values: Array, start: NDArray[np.int64], count: int) -> NDArra
     return order[(rank < count) & (values[order] > 0.0)]
 
 
-def _near_lists(
-    scene: ScenePoints, diameter_mm: float, o: PairRegistrationOptions, rng: np.random.Generator
-) -> NDArray[np.int64]:
+def _near_lists(scene: ScenePoints, diameter_mm: float, rng: np.random.Generator) -> NDArray[np.int64]:
     """(N,J) for each scene point, points within 0.6 diameters in random order, rare ones preferred; -1 at the end."""
     count = len(scene.points)
-    lists = np.full((count, 4 * o.scored), -1, dtype=np.int64)
+    lists = np.full((count, 4 * SCORED), -1, dtype=np.int64)
     width = min(count, lists.shape[1])
     points = (scene.points - scene.points.mean(axis=0)).astype(np.float32)
     squares = np.sum(points**2, axis=1)
     slowness = (1.0 / scene.weights).astype(np.float32)
     # In blocks, since the table of all together would fill a gigabyte.
-    block = max(1, o.list_block // count)
+    block = max(1, LIST_BLOCK // count)
     for first in range(0, count, block):
         part = slice(first, first + block)
         square = squares[part, None] + squares[None] - 2.0 * points[part] @ points.T
@@ -302,42 +331,70 @@ def _near_lists(
 
 
 def _scored(
-    poses: Array, start: NDArray[np.int64], lists: NDArray[np.int64], scene: ScenePoints, normals: Array,
-    target: _Target, reach: float,
-) -> Array:  # fmt: skip
+    poses: Array,
+    start: NDArray[np.int64],
+    lists: NDArray[np.int64],
+    scene: ScenePoints,
+    normals: Array,
+    target: _Target,
+    reach: float,
+) -> Array:
     """(K,) scores of poses, computed in all threads."""
     lists = np.ascontiguousarray(lists)
 
     def work(part: NDArray[np.int64]) -> Array:
         return scores(
-            poses[part], start[part], lists, scene.points, normals, scene.weights, target.nodes, target.field,
-            target.low, target.cell, reach * target.diameter_mm, scene.is_oriented,
-        )  # fmt: skip
+            poses[part],
+            start[part],
+            lists,
+            points=scene.points,
+            normals=normals,
+            point_weights=scene.weights,
+            nodes=target.nodes,
+            field=target.field,
+            low=target.low,
+            cell=target.cell,
+            reach=reach * target.diameter_mm,
+            is_oriented=scene.is_oriented,
+        )
 
     parts = np.array_split(np.arange(len(poses)), 4 * thread_count())
     return np.concatenate(list(pool().map(work, parts)))
 
 
 def _refine(
-    poses: Array, start: NDArray[np.int64], lists: NDArray[np.int64], scene: ScenePoints, normals: Array,
-    target: _Target, o: PairRegistrationOptions,
-) -> Array:  # fmt: skip
+    poses: Array,
+    start: NDArray[np.int64],
+    lists: NDArray[np.int64],
+    scene: ScenePoints,
+    normals: Array,
+    target: _Target,
+) -> Array:
     """Poses refined in the distance field, in all threads."""
-    reaches = target.diameter_mm * np.geomspace(1.5 * o.coarse_reach, o.fine_reach, 14)
+    reaches = target.diameter_mm * np.geomspace(1.5 * COARSE_REACH, FINE_REACH, 14)
 
     def work(part: NDArray[np.int64]) -> Array:
         return refined(
-            poses[part], start[part], lists, scene.points, normals, scene.weights, target.nodes, target.field,
-            target.low, target.cell, reaches, 0.3 * target.diameter_mm, scene.is_oriented,
-        )  # fmt: skip
+            poses[part],
+            start[part],
+            lists,
+            points=scene.points,
+            normals=normals,
+            point_weights=scene.weights,
+            nodes=target.nodes,
+            field=target.field,
+            low=target.low,
+            cell=target.cell,
+            reaches=reaches,
+            size=0.3 * target.diameter_mm,
+            is_oriented=scene.is_oriented,
+        )
 
     parts = np.array_split(np.arange(len(poses)), 4 * thread_count())
     return np.concatenate(list(pool().map(work, parts)))
 
 
-def _different(
-    found: list[tuple[Array, float]], target: _Target, o: PairRegistrationOptions
-) -> list[tuple[Array, float]]:
+def _different(found: list[tuple[Array, float]], target: _Target) -> list[tuple[Array, float]]:
     """The best poses (4,4) with their signs, without those near a better one."""
     kept: list[tuple[Array, float, Array]] = []
     some = target.points[::15]
@@ -346,25 +403,28 @@ def _different(
         back = apply(invert(pose), some)
         if all(np.linalg.norm(back - b, axis=1).mean() > 0.02 * target.diameter_mm for _, _, b in kept):
             kept.append((pose, sign, back))
-        if len(kept) == o.kept:
+        if len(kept) == KEPT:
             break
     return [(pose, sign) for pose, sign, _ in kept]
 
 
-def _exact(
-    start: tuple[Array, float], scene: ScenePoints, target: _Target, o: PairRegistrationOptions
-) -> PartPlacement | None:
+def _exact(start: tuple[Array, float], scene: ScenePoints, target: _Target) -> PartPlacement | None:
     """A pose refined on the exact surface, and judged there; None if it does not converge."""
     pose, sign = start
-    reach_mm = o.fine_reach * target.diameter_mm
+    reach_mm = FINE_REACH * target.diameter_mm
     low, high = target.samples.min(axis=0) - 3.0 * reach_mm, target.samples.max(axis=0) + 3.0 * reach_mm
     moved = apply(pose, scene.fine)
     near = np.all((moved > low) & (moved < high), axis=1)
     points, normals = scene.fine[near], sign * scene.fine_normals[near]
     options = RegistrationOptions(
-        noise_points=0, first_distance_mm=2.0 * reach_mm, last_distance_mm=min(0.5, reach_mm), threshold_mm=1e-3,
-        threshold_deg=1e-3, max_iterations=25, min_points=20,
-    )  # fmt: skip
+        noise_points=0,
+        first_distance_mm=2.0 * reach_mm,
+        last_distance_mm=min(0.5, reach_mm),
+        threshold_mm=1e-3,
+        threshold_deg=1e-3,
+        max_iterations=25,
+        min_points=20,
+    )
     for _ in range(2):  # unoriented normals follow the surface at the start
         if not scene.is_oriented and len(points):
             closest = target.surface.closest(apply(pose, points), 3.0 * reach_mm)

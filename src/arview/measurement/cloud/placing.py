@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,14 +18,12 @@ from arview.measurement.cloud.reading import UNITS_MM, RawPoints
 from arview.reconstruction.scale.similarity import Similarity
 from arview.reconstruction.types import DenseCloud
 
-
-@dataclass(frozen=True)
-class ThinningOptions:
-    """Options of thinning large clouds; those below the limit keep every point."""
-
-    max_points: int = 2_500_000  # a larger cloud is averaged on a grid
-    grid_mm: float = 0.25  # cell of that grid: half the cell on which components are measured
-    chunk_points: int = 4_000_000  # points averaged at a time, so that memory does not grow with the cloud
+MAX_POINTS = 2_500_000
+"""A larger cloud is averaged on a grid."""
+GRID_MM = 0.25
+"""Cell of that grid: half the cell on which components are measured."""
+CHUNK_POINTS = 4_000_000
+"""Points averaged at a time, so that memory does not grow with the cloud."""
 
 
 def dense_cloud(points: Array, normals: NDArray[np.floating] | None) -> DenseCloud:
@@ -33,23 +31,26 @@ def dense_cloud(points: Array, normals: NDArray[np.floating] | None) -> DenseClo
     count = len(points)
     normals32 = np.zeros((count, 3), np.float32) if normals is None else np.asarray(normals, dtype=np.float32)
     return DenseCloud(
-        np.asarray(points, dtype=np.float64), normals32, np.zeros((count, 3), np.uint8),
-        np.full(count, np.nan, np.float32), np.zeros(count, np.uint8),
-    )  # fmt: skip
+        np.asarray(points, dtype=np.float64),
+        normals32,
+        np.zeros((count, 3), np.uint8),
+        np.full(count, np.nan, np.float32),
+        np.zeros(count, np.uint8),
+    )
 
 
-def cloud_in_mm(raw: RawPoints, unit: str, options: ThinningOptions | None = None) -> DenseCloud:
+def cloud_in_mm(raw: RawPoints, unit: str) -> DenseCloud:
     """The points of a file in mm, averaged on a grid if there are very many."""
-    o, factor = options or ThinningOptions(), UNITS_MM[unit]
-    if len(raw) <= o.max_points:
+    factor = UNITS_MM[unit]
+    if len(raw) <= MAX_POINTS:
         return dense_cloud((raw.points + raw.origin) * factor, raw.normals)
     parts: list[CloudPoints] = []
-    for start in range(0, len(raw), o.chunk_points):
-        part = slice(start, start + o.chunk_points)
+    for start in range(0, len(raw), CHUNK_POINTS):
+        part = slice(start, start + CHUNK_POINTS)
         points = raw.points[part].astype(np.float64) * factor
         normals = np.zeros_like(points) if raw.normals is None else raw.normals[part].astype(np.float64)
-        parts.append(grid_average(CloudPoints(points, normals, np.ones(len(points))), o.grid_mm))
-    together = grid_average(join(parts), o.grid_mm) if len(parts) > 1 else parts[0]
+        parts.append(grid_average(CloudPoints(points, normals, np.ones(len(points))), GRID_MM))
+    together = grid_average(join(parts), GRID_MM) if len(parts) > 1 else parts[0]
     return dense_cloud(together.points + raw.origin * factor, None if raw.normals is None else together.normals)
 
 
@@ -131,9 +132,11 @@ def moved_to_model(cloud: DenseCloud, found: Similarity) -> DenseCloud:
     """The cloud in the frame of the CAD."""
     rotation = found.model_from_scan[:3, :3].astype(np.float32)
     return replace(
-        cloud, points=apply(found.model_from_scan, cloud.points * found.scale if found.scale != 1.0 else cloud.points),
-        normals=cloud.normals @ rotation.T, sigma=np.asarray(cloud.sigma * found.scale, dtype=np.float32),
-    )  # fmt: skip
+        cloud,
+        points=apply(found.model_from_scan, cloud.points * found.scale if found.scale != 1.0 else cloud.points),
+        normals=cloud.normals @ rotation.T,
+        sigma=np.asarray(cloud.sigma * found.scale, dtype=np.float32),
+    )
 
 
 def check_belongs(points: CloudPoints, model: Model, band_mm: float) -> None:

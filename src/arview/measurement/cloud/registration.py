@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,8 +21,21 @@ from arview.measurement.cloud.noise import NoiseModel, estimate_noise, spread_of
 
 NAMES = ("rx", "ry", "rz", "tx", "ty", "tz")
 """Degrees of freedom, in the order of a twist."""
-TUKEY_SIGMAS, HUBER_SIGMAS = 4.685, 1.345
-"""Tuning constants of the robust kernels: 95 % efficiency for normal errors."""
+TUKEY_SIGMAS = 4.685
+"""Width of Tukey's kernel in standard deviations: 95 % efficiency for normal errors. The kernel starts as wide as the
+first distance and shrinks to the noise; narrow from the start, it would take a face displaced by more than the noise
+for an outlier."""
+DISTANCE_SIGMAS = 6.0
+"""Maximum distance in widths of the kernel."""
+SHRINK = 1.0 / 3.0
+"""Factor by which the width decreases in each iteration, until it reaches the noise."""
+MIN_NORMAL_COSINE = 0.5
+"""Points whose normal makes a larger angle with the surface's belong to another face."""
+MIN_INFORMATION = 1e-4
+"""Motions with less information per point, as a share of the largest possible, are undetermined; rotations are
+converted by the size of the cloud."""
+SEED = 0
+"""Of the choice of these points."""
 
 
 @dataclass(frozen=True)
@@ -31,49 +43,26 @@ class RegistrationOptions:
     """Options of the registration.
 
     Attributes:
-        kernel: weighting of residuals: ``tukey`` ignores outliers, ``huber`` limits them, ``none`` is least squares.
-            Its width starts at the first distance and shrinks to the noise; with a narrow kernel from the start, a face
-            displaced by more than the noise would be taken for an outlier.
-        trim: share of the points, those with the largest residuals, that each iteration leaves out.
         first_distance_mm: maximum distance of points from the surface in the first iteration.
         last_distance_mm: maximum distance in the last iteration, unless the noise is larger.
-        distance_sigmas: maximum distance in widths of the kernel.
-        shrink: factor by which the width decreases in each iteration, until it reaches the noise.
         threshold_mm, threshold_deg: converged when a step moves the centre and rotates the points by less than this.
         max_iterations: of the solver, which needs 4 to 15.
-        skips_edges: leave out points whose closest point lies on an edge: with noise they pull to its outside.
-        min_normal_cosine: points whose normal makes a larger angle with the surface's belong to another face.
-        min_information: motions with less information per point, as a share of the largest possible, are undetermined;
-            rotations are converted by the size of the cloud.
         min_points: fewer points cannot be registered.
         min_width_mm: lower bound of the kernel's width: surfaces displaced by less are never treated as outliers.
         noise_points: points from which the noise is estimated; 0 assumes independent errors, which makes the covariance
             far too small for real clouds.
-        seed: of the choice of these points.
     """
 
-    kernel: Literal["tukey", "huber", "none"] = "tukey"
-    trim: float = 0.0
     first_distance_mm: float = 5.0
     last_distance_mm: float = 0.2
-    distance_sigmas: float = 6.0
-    shrink: float = 1.0 / 3.0
     threshold_mm: float = 1e-4
     threshold_deg: float = 1e-4
     max_iterations: int = 60
-    skips_edges: bool = True
-    min_normal_cosine: float = 0.5
-    min_information: float = 1e-4
     min_points: int = 50
     min_width_mm: float = 0.0
     noise_points: int = 240
-    seed: int = 0
 
     def __post_init__(self) -> None:
-        if self.kernel not in ("tukey", "huber", "none"):
-            raise InputError(f"registration: kernel {self.kernel!r}, expected tukey, huber or none")
-        if not 0.0 <= self.trim < 0.9:
-            raise InputError(f"registration: trim {self.trim} must be at least 0 and below 0.9")
         if not 0.0 < self.last_distance_mm <= self.first_distance_mm:
             raise InputError(
                 f"registration: distances {self.first_distance_mm} … {self.last_distance_mm} mm must be positive and "
@@ -205,25 +194,23 @@ def register_to_surface(
     )
     center = apply(pose, points).mean(axis=0) if center is None else np.asarray(center, dtype=np.float64)
     radius = radius_mm or float(np.sqrt(np.mean(np.sum((apply(pose, points) - center) ** 2, axis=1)))) or 1.0
-    scales = _scales(radius)
-    basis = np.eye(6) if free is None else _orthonormal(free / scales)
-    width, hint, converged = o.first_distance_mm / o.distance_sigmas, None, False
-    iterations = 0
+    basis = np.eye(6) if free is None else _orthonormal(free / _scales(radius))
+    problem = _Problem(points, normals, base, surface, usable_faces, center, radius, basis=basis, options=o)
+    width, hint, converged, iterations = o.first_distance_mm / DISTANCE_SIGMAS, None, False, 0
     while iterations < o.max_iterations:
         iterations += 1
-        system = _measure(points, normals, base, surface, usable_faces, pose, center, radius, basis, width, hint, o)
+        system = problem.linearised(pose, width, hint)
         step = -(system.vectors / system.values) @ (system.vectors.T @ (basis @ system.gradient))
-        twist = (basis.T @ step) * scales
+        twist = (basis.T @ step) * _scales(radius)
         pose = move_about(center, twist) @ pose
         hint = system.faces
         turned_deg = float(np.rad2deg(np.linalg.norm(twist[:3])))
-        is_narrow = width <= max(system.sigma, o.min_width_mm, o.last_distance_mm / o.distance_sigmas)
+        is_narrow = width <= max(system.sigma, o.min_width_mm, o.last_distance_mm / DISTANCE_SIGMAS)
         if is_narrow and np.linalg.norm(twist[3:]) < o.threshold_mm and turned_deg < o.threshold_deg:
             converged = True
             break
-        width = max(system.sigma, o.min_width_mm, o.shrink * width)
-    system = _measure(points, normals, base, surface, usable_faces, pose, center, radius, basis, width, hint, o)
-    return _result(system, pose, center, radius, basis, base, iterations, converged, o)
+        width = max(system.sigma, o.min_width_mm, SHRINK * width)
+    return problem.result(problem.linearised(pose, width, hint), pose, iterations, converged)
 
 
 def register_from_starts(
@@ -253,8 +240,10 @@ def register_from_starts(
     """
     o = options or RegistrationOptions()
     few = slice(None, None, -(-len(points) // coarse_points))
-    some = {"normals": normals[few] if normals is not None else None,
-            "point_weights": point_weights[few] if point_weights is not None else None}  # fmt: skip
+    some = {
+        "normals": normals[few] if normals is not None else None,
+        "point_weights": point_weights[few] if point_weights is not None else None,
+    }
     quick = replace(o, noise_points=0, threshold_mm=0.01, threshold_deg=0.01, max_iterations=15)
     found: list[Registration] = []
     failure: InputError | None = None
@@ -275,9 +264,14 @@ def register_from_starts(
         if np.sqrt(np.mean(np.sum((apply(item.surface_from_points, points[few]) - placed) ** 2, axis=1))) > apart_mm
     ]
     result = register_to_surface(
-        points, surface, best.surface_from_points, normals=normals, point_weights=point_weights,
-        options=replace(o, first_distance_mm=max(o.last_distance_mm, min(o.first_distance_mm, limit))), **given,  # type: ignore[arg-type]
-    )  # fmt: skip
+        points,
+        surface,
+        best.surface_from_points,
+        normals=normals,
+        point_weights=point_weights,
+        options=replace(o, first_distance_mm=max(o.last_distance_mm, min(o.first_distance_mm, limit))),
+        **given,  # type: ignore[arg-type]
+    )
     if not rivals:
         return result
     cost, rival = min(rivals, key=lambda item: item[0])
@@ -301,95 +295,101 @@ class _LinearSystem:
     faces: NDArray[np.int64]
 
 
-def _measure(
-    points: Array, point_normals: Array | None, base: Array, surface: MeshSurface,
-    usable_faces: NDArray[np.bool_] | None, pose: Array, center: Array, radius: float, basis: Array, width: float,
-    hint: NDArray[np.int64] | None, o: RegistrationOptions,
-) -> _LinearSystem:  # fmt: skip
-    """Residuals, weights and normal equations at a pose; rotations are in mm at ``radius``."""
-    moved = apply(pose, points)
-    reach = min(max(o.distance_sigmas * width, o.last_distance_mm), o.first_distance_mm)
-    closest = surface.closest(moved, reach, hint)
-    residuals = closest.distances
-    counts = closest.faces >= 0
-    if usable_faces is not None:
-        counts &= usable_faces[closest.faces]
-    if o.skips_edges:
-        counts &= ~closest.is_edge
-    if point_normals is not None:
-        cosine = np.sum((point_normals @ pose[:3, :3].T) * np.nan_to_num(closest.normals), axis=1)
-        counts &= (cosine >= o.min_normal_cosine) | ~point_normals.any(axis=1)
-    if np.count_nonzero(counts) < max(6, o.min_points // 4):
-        raise InputError(
-            f"registration: {np.count_nonzero(counts)} of {len(points)} points are within {reach:.2f} mm of the surface"
+@dataclass(frozen=True)
+class _Problem:
+    """Points to be registered to a surface, see `register_to_surface`; rotations are in mm at ``radius``."""
+
+    points: Array
+    point_normals: Array | None
+    base: Array
+    surface: MeshSurface
+    usable_faces: NDArray[np.bool_] | None
+    center: Array
+    radius: float
+    basis: Array
+    options: RegistrationOptions
+
+    def linearised(self, pose: Array, width: float, hint: NDArray[np.int64] | None) -> _LinearSystem:
+        """Residuals, weights and normal equations at a pose (4,4) for a kernel of some width in mm."""
+        o = self.options
+        moved = apply(pose, self.points)
+        reach = min(max(DISTANCE_SIGMAS * width, o.last_distance_mm), o.first_distance_mm)
+        closest = self.surface.closest(moved, reach, hint)
+        residuals = closest.distances
+        # Points whose closest point lies on an edge are left out: with noise they pull to its outside.
+        counts = (closest.faces >= 0) & ~closest.is_edge
+        if self.usable_faces is not None:
+            counts &= self.usable_faces[closest.faces]
+        if self.point_normals is not None:
+            cosine = np.sum((self.point_normals @ pose[:3, :3].T) * np.nan_to_num(closest.normals), axis=1)
+            counts &= (cosine >= MIN_NORMAL_COSINE) | ~self.point_normals.any(axis=1)
+        found = np.count_nonzero(counts)
+        if found < max(6, o.min_points // 4):
+            raise InputError(f"registration: {found} of {len(moved)} points are within {reach:.2f} mm of the surface")
+        size = np.abs(np.where(counts, residuals, 0.0)) * np.sqrt(self.base)
+        sigma = max(1.4826 * float(np.median(size[counts])), 1e-9)
+        weights = np.where(counts, _tukey(size / max(sigma, width, o.min_width_mm)), 0.0) * self.base
+        normals = np.where(counts[:, None], closest.normals, 0.0)
+        rows = np.hstack([np.cross(moved - self.center, normals) / self.radius, normals])
+        weighted = rows * weights[:, None]
+        hessian = weighted.T @ rows
+        values, vectors = np.linalg.eigh(self.basis @ hessian @ self.basis.T)
+        kept = values > MIN_INFORMATION * weights.sum()
+        return _LinearSystem(
+            residuals,
+            weights,
+            rows,
+            normals,
+            moved,
+            hessian,
+            gradient=weighted.T @ np.where(counts, residuals, 0.0),
+            values=values[kept],
+            vectors=vectors[:, kept],
+            sigma=sigma,
+            faces=closest.faces,
         )
-    size = np.abs(np.where(counts, residuals, 0.0)) * np.sqrt(base)
-    if o.trim > 0.0:
-        counts &= size <= np.quantile(size[counts], 1.0 - o.trim)
-    sigma = max(1.4826 * float(np.median(size[counts])), 1e-9)
-    weights = np.where(counts, _kernel(size / max(sigma, width, o.min_width_mm), o.kernel), 0.0) * base
-    normals = np.where(counts[:, None], closest.normals, 0.0)
-    rows = np.hstack([np.cross(moved - center, normals) / radius, normals])
-    weighted = rows * weights[:, None]
-    hessian = weighted.T @ rows
-    values, vectors = np.linalg.eigh(basis @ hessian @ basis.T)
-    kept = values > o.min_information * weights.sum()
-    gradient = weighted.T @ np.where(counts, residuals, 0.0)
-    return _LinearSystem(
-        residuals, weights, rows, normals, moved, hessian, gradient, values[kept], vectors[:, kept], sigma,
-        closest.faces,
-    )  # fmt: skip
+
+    def result(self, system: _LinearSystem, pose: Array, iterations: int, converged: bool) -> Registration:
+        """The registration with its covariance."""
+        determined = system.vectors.T @ self.basis
+        scales = _scales(self.radius)
+        used = np.flatnonzero(system.weights > 0.1 * self.base)
+        residuals, weights = system.residuals[used], system.weights[used]
+        own = np.sqrt(self.base[used])  # residuals × own have equal variance
+        noise = estimate_noise(
+            system.moved[used],
+            system.normals[used],
+            residuals * own,
+            (system.rows[used] * own[:, None]) @ determined.T,
+            self.options.noise_points,
+            SEED,
+        )
+        # A residual moves the result by H⁻¹ Jᵀ w; the covariance is that of the sum of correlated residuals.
+        pull = (determined.T / system.values) @ (determined @ (system.rows[used] * (weights / own)[:, None]).T)
+        scatter = spread_of_sum(system.moved[used], system.normals[used], pull, noise, SEED)
+        return Registration(
+            surface_from_points=pose,
+            twist=twist_about(self.center, pose),
+            center=self.center,
+            radius_mm=self.radius,
+            free=self.basis,
+            undetermined=_orthogonal_complement(self.basis, determined),
+            information=system.hessian / np.outer(scales, scales),
+            covariance=scatter * np.outer(scales, scales),
+            noise=noise,
+            residuals=system.residuals,
+            weights=system.weights / np.maximum(self.base, 1e-300),
+            rms_mm=float(np.sqrt(np.average(residuals**2, weights=weights))),
+            sigma_mm=system.sigma,
+            overlap=float(np.mean(system.weights > 0.5 * self.base)),
+            iterations=iterations,
+            converged=converged,
+        )
 
 
-def _kernel(size: Array, kernel: str) -> Array:
-    """Weights 0–1 for residuals in standard deviations."""
-    if kernel == "none":
-        return np.ones_like(size)
-    if kernel == "huber":
-        return np.minimum(1.0, HUBER_SIGMAS / np.maximum(size, 1e-12))
+def _tukey(size: Array) -> Array:
+    """Tukey's weights 0–1 for residuals in standard deviations."""
     return np.where(size < TUKEY_SIGMAS, (1.0 - np.minimum(size / TUKEY_SIGMAS, 1.0) ** 2) ** 2, 0.0)
-
-
-def _result(
-    system: _LinearSystem, pose: Array, center: Array, radius: float, basis: Array, base: Array, iterations: int,
-    converged: bool, o: RegistrationOptions,
-) -> Registration:  # fmt: skip
-    """The registration with its covariance."""
-    determined = system.vectors.T @ basis
-    scales = _scales(radius)
-    used = np.flatnonzero(system.weights > 0.1 * base)
-    residuals, weights = system.residuals[used], system.weights[used]
-    own = np.sqrt(base[used])  # residuals × own have equal variance
-    noise = estimate_noise(
-        system.moved[used],
-        system.normals[used],
-        residuals * own,
-        (system.rows[used] * own[:, None]) @ determined.T,
-        o.noise_points,
-        o.seed,
-    )
-    # A residual moves the result by H⁻¹ Jᵀ w; the covariance is that of the sum of correlated residuals.
-    pull = (determined.T / system.values) @ (determined @ (system.rows[used] * (weights / own)[:, None]).T)
-    scatter = spread_of_sum(system.moved[used], system.normals[used], pull, noise, o.seed)
-    undetermined = _orthogonal_complement(basis, determined)
-    return Registration(
-        surface_from_points=pose,
-        twist=twist_about(center, pose),
-        center=center,
-        radius_mm=radius,
-        free=basis,
-        undetermined=undetermined,
-        information=system.hessian / np.outer(scales, scales),
-        covariance=scatter * np.outer(scales, scales),
-        noise=noise,
-        residuals=system.residuals,
-        weights=system.weights / np.maximum(base, 1e-300),
-        rms_mm=float(np.sqrt(np.average(residuals**2, weights=weights))),
-        sigma_mm=system.sigma,
-        overlap=float(np.mean(system.weights > 0.5 * base)),
-        iterations=iterations,
-        converged=converged,
-    )
 
 
 def _cost(found: Registration, limit: float) -> float:

@@ -17,19 +17,21 @@ from arview.measurement.cloud.mesh_surface import MeshSurface
 from arview.measurement.cloud.points import prepare_cloud
 from arview.reconstruction.types import DenseCloud
 
-
-@dataclass(frozen=True)
-class ScaleCheckOptions:
-    """Options of the comparison."""
-
-    reach_mm: float = 4.0  # points farther from the base are left out in the first step
-    noise_mm: float = 0.15  # width of the kernel in the last step, unless the noise is larger
-    grid_mm: float = 1.0  # the cloud is averaged on this grid
-    max_points: int = 60_000  # points that are used
-    form_mm: float = 0.03  # standard uncertainty of the base's own length
-    significant: float = 3.0  # standard deviations above which a scale contradicts the CAD
-    min_excess: float = 3e-4  # smaller relative differences are not reported as contradictions
-    steps: int = 15
+REACH_MM = 4.0
+"""Points farther from the base are left out in the first step."""
+NOISE_MM = 0.15
+"""Width of the kernel in the last step, unless the noise is larger."""
+GRID_MM = 1.0
+"""The cloud is averaged on this grid."""
+MAX_POINTS = 60_000
+"""Points that are used."""
+FORM_MM = 0.03
+"""Standard uncertainty of the base's own length."""
+SIGNIFICANT = 3.0
+"""Standard deviations above which a scale contradicts the CAD."""
+MIN_EXCESS = 3e-4
+"""Smaller relative differences are not reported as contradictions."""
+STEPS = 15
 
 
 @dataclass(frozen=True)
@@ -47,47 +49,43 @@ class CloudScale:
     is_contradiction: bool
 
 
-def cloud_scale(
-    cloud: DenseCloud, model: Model, names: tuple[str, ...], options: ScaleCheckOptions | None = None
-) -> CloudScale | None:
+def cloud_scale(cloud: DenseCloud, model: Model, names: tuple[str, ...]) -> CloudScale | None:
     """Scale of a cloud, in mm and in the rough frame of the CAD, from its points on some components; None if unknown.
 
     Args:
         cloud: within some mm of the CAD.
         model: the nominal CAD.
         names: components of the base.
-        options: see `ScaleCheckOptions`.
     """
-    o = options or ScaleCheckOptions()
     parts = [model.component(name) for name in names]
     offsets = np.cumsum([0, *(len(part.vertices_in_model) for part in parts)])
     vertices = np.concatenate([part.vertices_in_model for part in parts])
     surface = MeshSurface(
         vertices, np.concatenate([p.faces + start for p, start in zip(parts, offsets[:-1], strict=True)])
     )
-    box = np.stack([vertices.min(axis=0) - o.reach_mm, vertices.max(axis=0) + o.reach_mm])
+    box = np.stack([vertices.min(axis=0) - REACH_MM, vertices.max(axis=0) + REACH_MM])
     try:
-        points = prepare_cloud(cloud, box, o.grid_mm, 500).points
+        points = prepare_cloud(cloud, box, GRID_MM, 500).points
     except InputError:
         return None
-    if len(points) > o.max_points:
-        points = points[np.random.default_rng(0).permutation(len(points))[: o.max_points]]
+    if len(points) > MAX_POINTS:
+        points = points[np.random.default_rng(0).permutation(len(points))[:MAX_POINTS]]
     size = 0.5 * float(np.linalg.norm(np.ptp(vertices, axis=0)))
-    fit = _fit(points, surface, size, o)
+    fit = _fit(points, surface, size)
     if fit is None:
         return None
     factor, std = fit
-    std = float(np.hypot(std, o.form_mm / size))
+    std = float(np.hypot(std, FORM_MM / size))
     excess = abs(factor - 1.0)
-    return CloudScale(factor, std, excess > max(o.significant * std, o.min_excess))
+    return CloudScale(factor, std, excess > max(SIGNIFICANT * std, MIN_EXCESS))
 
 
-def _fit(points: Array, surface: MeshSurface, size: float, o: ScaleCheckOptions) -> tuple[float, float] | None:
+def _fit(points: Array, surface: MeshSurface, size: float) -> tuple[float, float] | None:
     """Factor and standard deviation by Gauss-Newton on seven parameters with Tukey's weights; None if undetermined."""
     center = points.mean(axis=0)
     pose, shrink = np.eye(4), 1.0
-    width = o.reach_mm
-    for _ in range(o.steps):
+    width = REACH_MM
+    for _ in range(STEPS):
         moved = shrink * (points @ pose[:3, :3].T + pose[:3, 3])
         closest = surface.closest(moved, width)
         near = (closest.faces >= 0) & ~closest.is_edge
@@ -109,6 +107,6 @@ def _fit(points: Array, surface: MeshSurface, size: float, o: ScaleCheckOptions)
         shift = grown * turn @ (shrink * pose[:3, 3] - center) + center + step[3:6]
         pose, shrink = rigid(rotation, shift / total), total
         sigma = 1.4826 * float(np.median(np.abs(r)))
-        width = max(0.5 * width, 4.7 * sigma, o.noise_mm)
+        width = max(0.5 * width, 4.7 * sigma, NOISE_MM)
     spread = float(np.sqrt(np.average(r**2, weights=weights)))
     return 1.0 / shrink, float(np.sqrt(inverse[6, 6])) * 10.0 * spread / size

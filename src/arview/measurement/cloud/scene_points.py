@@ -15,25 +15,35 @@ from arview.measurement.cloud.open3d_library import load_open3d
 Flags = NDArray[np.bool_]
 
 
-@dataclass(frozen=True)
-class ScenePointOptions:
-    """Options of the preparation. Lengths are shares of the part's diameter unless named otherwise."""
-
-    max_points: int = 400_000  # points that are looked at, at random if there are more
-    coarse: float = 0.014  # cell of the grid for pairs
-    fine: float = 0.006  # cell of the grid for judging places
-    max_coarse: int = 9000  # points for pairs; with more the cells grow
-    normal_neighbours: int = 24  # points from which a normal is estimated
-    stray_neighbours: int = 12  # points whose mean distance tells strays
-    stray_sigmas: float = 3.0  # standard deviations above the mean distance
-    plane_tolerance: float = 0.004  # distance within which points are on a plane
-    plane_excess: float = 1.25  # a plane wider than the part by this factor is what it stands on
-    max_planes: int = 3  # planes that are removed
-    min_points: int = 200  # points that a cloud needs
-    flat_variation: float = 0.05  # least eigenvalue, as a share of all, below which neighbours lie on a surface
-    min_flat: float = 0.005  # share of such neighbourhoods below which the points lie on no surface
-    min_flat_points: int = 1000  # points from which this is asked
-    seed: int = 0
+MAX_POINTS = 400_000
+"""Points that are looked at, at random if there are more."""
+COARSE = 0.014
+"""Cell of the grid for pairs."""
+FINE = 0.006
+"""Cell of the grid for judging places."""
+MAX_COARSE = 9000
+"""Points for pairs; with more the cells grow."""
+NORMAL_NEIGHBOURS = 24
+"""Points from which a normal is estimated."""
+STRAY_NEIGHBOURS = 12
+"""Points whose mean distance tells strays."""
+STRAY_SIGMAS = 3.0
+"""Standard deviations above the mean distance."""
+PLANE_TOLERANCE = 0.004
+"""Distance within which points are on a plane."""
+PLANE_EXCESS = 1.25
+"""A plane wider than the part by this factor is what it stands on."""
+MAX_PLANES = 3
+"""Planes that are removed."""
+MIN_POINTS = 200
+"""Points that a cloud needs."""
+FLAT_VARIATION = 0.05
+"""Least eigenvalue, as a share of all, below which neighbours lie on a surface."""
+MIN_FLAT = 0.005
+"""Share of such neighbourhoods below which the points lie on no surface."""
+MIN_FLAT_POINTS = 1000
+"""Points from which this is asked."""
+SEED = 0
 
 
 @dataclass(frozen=True)
@@ -58,67 +68,69 @@ class ScenePoints:
     removed: int
 
 
-def scene_points(
-    points: Array, normals: Array | None, diameter_mm: float, options: ScenePointOptions | None = None
-) -> ScenePoints:
+def scene_points(points: Array, normals: Array | None, diameter_mm: float) -> ScenePoints:
     """Prepare points (N,3) in mm, all finite, for the search of a part of a given diameter.
 
     Raises:
         InputError: too few points are left.
     """
-    o = options or ScenePointOptions()
-    if len(points) < o.min_points:
+    if len(points) < MIN_POINTS:
         raise InputError(
-            f"cloud: {len(points)} points are too few to find the part in it; at least {o.min_points} are needed"
+            f"cloud: {len(points)} points are too few to find the part in it; at least {MIN_POINTS} are needed"
         )
-    if len(points) > o.max_points:
-        few = np.random.default_rng(o.seed).permutation(len(points))[: o.max_points]
+    if len(points) > MAX_POINTS:
+        few = np.random.default_rng(SEED).permutation(len(points))[:MAX_POINTS]
         points, normals = points[few], None if normals is None else normals[few]
     has_normals = normals is not None and float(np.mean(np.linalg.norm(normals, axis=1) > 0.5)) > 0.9
-    kept = ~_strays(points, o)
+    kept = ~_strays(points)
     points = points[kept]
     own = normals[kept] if has_normals and normals is not None else None
-    if len(points) >= o.min_flat_points and _flat_share(points, o) < o.min_flat:
+    if len(points) >= MIN_FLAT_POINTS and _flat_share(points) < MIN_FLAT:
         raise InputError(
             "cloud: its points lie on no surface, so the part is not in it; is it the right file, and are its columns "
             "x, y, z?"
         )
-    estimated = _normals(points, o)
+    estimated = _normals(points)
     is_oriented = False
     if own is not None:
         sign = np.sign(np.sum(estimated * own, axis=1))
         is_oriented = _is_consistent(points, own)
         estimated = estimated * np.where(sign == 0.0, 1.0, sign)[:, None] if is_oriented else estimated
     before = len(points)
-    on_table = wide_planes(points, estimated, diameter_mm, o)
+    on_table = wide_planes(points, estimated, diameter_mm)
     points, estimated = points[~on_table], estimated[~on_table]
-    if len(points) < o.min_points:
+    if len(points) < MIN_POINTS:
         raise InputError("cloud: the part was not found in it: the cloud is flat")
-    fine = _thin(points, o.fine * diameter_mm)
-    cell = o.coarse * diameter_mm
+    fine = _thin(points, FINE * diameter_mm)
+    cell = COARSE * diameter_mm
     coarse = _thin(points, cell)
-    while len(coarse) > o.max_coarse:
+    while len(coarse) > MAX_COARSE:
         cell *= 1.15
         coarse = _thin(points, cell)
     weights = plane_weights(points[coarse], estimated[coarse], 0.01 * diameter_mm)
     return ScenePoints(
-        np.ascontiguousarray(points[coarse]), np.ascontiguousarray(estimated[coarse]), weights, points[fine],
-        estimated[fine], o.fine * diameter_mm, is_oriented, before - len(points),
-    )  # fmt: skip
+        np.ascontiguousarray(points[coarse]),
+        np.ascontiguousarray(estimated[coarse]),
+        weights,
+        fine=points[fine],
+        fine_normals=estimated[fine],
+        fine_mm=FINE * diameter_mm,
+        is_oriented=is_oriented,
+        removed=before - len(points),
+    )
 
 
-def wide_planes(points: Array, normals: Array, diameter_mm: float, options: ScenePointOptions | None = None) -> Flags:
+def wide_planes(points: Array, normals: Array, diameter_mm: float) -> Flags:
     """(N,) bool, whether points are on a plane that is wider than the part, such as a table or a wall.
 
     Planes are found by Open3D's RANSAC, on few points.
     """
-    o = options or ScenePointOptions()
     o3d = load_open3d()
     out = np.zeros(len(points), dtype=bool)
-    few = _thin(points, 2.0 * o.coarse * diameter_mm)
-    tolerance = max(o.plane_tolerance * diameter_mm, 1e-6)
-    o3d.utility.random.seed(o.seed)
-    for _ in range(o.max_planes):
+    few = _thin(points, 2.0 * COARSE * diameter_mm)
+    tolerance = max(PLANE_TOLERANCE * diameter_mm, 1e-6)
+    o3d.utility.random.seed(SEED)
+    for _ in range(MAX_PLANES):
         rest = few[~out[few]]
         if len(rest) < 100:
             break
@@ -130,7 +142,7 @@ def wide_planes(points: Array, normals: Array, diameter_mm: float, options: Scen
             break
         axes = np.linalg.svd(flat - flat.mean(axis=0), full_matrices=False)[2]
         size = np.ptp(np.quantile((flat - flat.mean(axis=0)) @ axes[:2].T, [0.03, 0.97], axis=0), axis=0)
-        is_wide = bool(np.linalg.norm(size) > o.plane_excess * diameter_mm)
+        is_wide = bool(np.linalg.norm(size) > PLANE_EXCESS * diameter_mm)
         near = np.abs(points @ normal + plane[3]) < tolerance
         if not is_wide:
             break
@@ -163,30 +175,30 @@ def plane_weights(points: Array, normals: Array, tolerance: float, share: float 
     return weights
 
 
-def _strays(points: Array, o: ScenePointOptions) -> Flags:
+def _strays(points: Array) -> Flags:
     """(N,) bool, points far from their neighbours, by Open3D's statistical outlier removal."""
     o3d = load_open3d()
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
-    _, kept = cloud.remove_statistical_outlier(o.stray_neighbours, o.stray_sigmas)
+    _, kept = cloud.remove_statistical_outlier(STRAY_NEIGHBOURS, STRAY_SIGMAS)
     out = np.ones(len(points), dtype=bool)
     out[np.asarray(kept)] = False
     return out
 
 
-def _flat_share(points: Array, o: ScenePointOptions) -> float:
+def _flat_share(points: Array) -> float:
     """Share of some points whose neighbours lie on a surface, by the surface variation of Pauly et al. (2002)."""
-    few = np.random.default_rng(o.seed).permutation(len(points))[:1000]
-    _, near = cKDTree(points).query(points[few], k=o.normal_neighbours)
+    few = np.random.default_rng(SEED).permutation(len(points))[:1000]
+    _, near = cKDTree(points).query(points[few], k=NORMAL_NEIGHBOURS)
     around = points[near] - points[near].mean(axis=1, keepdims=True)
     sizes = np.linalg.eigvalsh(np.einsum("nki,nkj->nij", around, around))
-    return float(np.mean(sizes[:, 0] <= o.flat_variation * sizes.sum(axis=1)))
+    return float(np.mean(sizes[:, 0] <= FLAT_VARIATION * sizes.sum(axis=1)))
 
 
-def _normals(points: Array, o: ScenePointOptions) -> Array:
+def _normals(points: Array) -> Array:
     """(N,3) normals of planes through neighbours, by Open3D; their sign is arbitrary."""
     o3d = load_open3d()
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
-    cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(o.normal_neighbours))
+    cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(NORMAL_NEIGHBOURS))
     return np.array(cloud.normals)
 
 

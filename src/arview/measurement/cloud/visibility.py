@@ -36,9 +36,15 @@ class SurfaceVisibility:
                 round(scale * photo.camera.width), round(scale * photo.camera.height)
             )
             inverse_depth, _ = rasterise(
-                apply(photo.cam_from_scan, vertices), faces, camera.fx, camera.fy, camera.cx, camera.cy,
-                camera.width, camera.height,
-            )  # fmt: skip
+                apply(photo.cam_from_scan, vertices),
+                faces,
+                camera.fx,
+                fy=camera.fy,
+                cx=camera.cx,
+                cy=camera.cy,
+                width=camera.width,
+                height=camera.height,
+            )
             # The depth of an inclined surface varies within a pixel: the farthest of 3 × 3 pixels is used.
             self._drawn.append((camera, cv2.erode(np.where(inverse_depth > 0, inverse_depth, np.inf), np.ones((3, 3)))))
 

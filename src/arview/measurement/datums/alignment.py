@@ -25,7 +25,10 @@ from arview.measurement.datums.directions import (
     shared_directions,
     shift_origin,
 )
-from arview.measurement.datums.equations import DOF_NAMES, AlignmentOptions, DatumEquations, point_from_move
+from arview.measurement.datums.equations import DOF_NAMES, DatumEquations, point_from_move
+
+FORM_MM = 0.005
+"""Standard uncertainty of a feature's position by its form: fine machining."""
 
 
 @dataclass(frozen=True)
@@ -93,9 +96,13 @@ class Alignment:
 
 
 def align(
-    datums: Sequence[DatumEquations], origin: Array, size_mm: float, base: DatumEquations | None = None,
-    scale_std: float = 0.0, finds_scale: bool = False, options: AlignmentOptions | None = None,
-) -> Alignment:  # fmt: skip
+    datums: Sequence[DatumEquations],
+    origin: Array,
+    size_mm: float,
+    base: DatumEquations | None = None,
+    scale_std: float = 0.0,
+    finds_scale: bool = False,
+) -> Alignment:
     """Solve for the datum frame.
 
     Args:
@@ -105,12 +112,10 @@ def align(
         base: best fit of the base, for the directions that the datums leave free.
         scale_std: relative standard deviation of the prior scale.
         finds_scale: whether the distances between holes and pins improve the scale.
-        options: see `AlignmentOptions`.
 
     Raises:
         InputError: a datum is not covered or locks nothing new, or a direction remains free; the message names it.
     """
-    options = options or AlignmentOptions()
     equations = [*datums, *([] if base is None else [base])]
     starts = np.cumsum([1, *(len(one.offsets_mm) for one in equations)])
     move, gain = np.zeros(7), np.zeros((7, int(starts[-1])))
@@ -126,7 +131,7 @@ def align(
         is_base = base is not None and one is base
         fit = fit_datum(one, is_base)
         if not is_base:
-            check_fit_covered(one, fit, options)
+            check_fit_covered(one, fit)
         rows = one.rows - one.rows[:, 3:6] @ shift_origin(origin)
         allowed = free if is_base else intersection(free, np.eye(6)[:, [name in one.locks for name in DOF_NAMES]])
         trusted = np.ones(len(rows)) if one.feature == "fit" else fit.weights
@@ -163,13 +168,20 @@ def align(
             notes.append(f"scale from the distance of datum {one.label}")
     if free.shape[1]:
         raise InputError(f"the datums leave {direction_names(free)} free, and there is no base to fit; add a datum")
-    return _result(origin, move, gain, variances, equations, starts, found, tuple(notes), options, size_mm)
+    return _result(origin, move, gain, variances, equations, starts, found, notes=tuple(notes), size_mm=size_mm)
 
 
 def _result(
-    origin: Array, move: Array, gain: Array, variances: Array, equations: Sequence[DatumEquations], starts: Array,
-    found: Sequence[tuple[DatumFit, str]], notes: tuple[str, ...], options: AlignmentOptions, size_mm: float,
-) -> Alignment:  # fmt: skip
+    origin: Array,
+    move: Array,
+    gain: Array,
+    variances: Array,
+    equations: Sequence[DatumEquations],
+    starts: Array,
+    found: Sequence[tuple[DatumFit, str]],
+    notes: tuple[str, ...],
+    size_mm: float,
+) -> Alignment:
     """The alignment with its covariance, and the result of each datum."""
     results, gains = [], []
     scale_covariance = variances[0] * np.outer(gain[:, 0], gain[:, 0])
@@ -182,7 +194,7 @@ def _result(
             reach = max(1.0, float(np.sqrt(((one.points - center) ** 2).sum(axis=1).mean())))
             rows = one.rows[:, :6] - one.rows[:, 3:6] @ shift_origin(center)[:, :6]
             common = part @ (rows / np.array([reach] * 3 + [1.0] * 3))
-            share = share + (options.form_mm**2 + one.form_mm**2) * common @ common.T
+            share = share + (FORM_MM**2 + one.form_mm**2) * common @ common.T
             if one.by_form is not None:
                 bent = part @ one.by_form
                 share = share + one.form_mm**2 * bent @ bent.T
@@ -194,14 +206,24 @@ def _result(
         used = int((fit.weights > 0.1 * fit.weights.max()).sum())
         results.append(
             DatumResult(
-                one.label, one.feature, locked, used, one.of, fit.sigma_mm, fit.correlation, fit.radius_mm,
-                rest_mm, share,
+                one.label,
+                one.feature,
+                locked,
+                used,
+                one.of,
+                fit.sigma_mm,
+                fit.correlation,
+                radius_mm=fit.radius_mm,
+                rest_mm=rest_mm,
+                covariance=share,
             )
-        )  # fmt: skip
+        )
         gains.append(part)
         covariance = covariance + share
     used_equations = tuple(equations[: len(found)])
-    return Alignment(origin, move, covariance, scale_covariance, tuple(results), tuple(gains), used_equations, notes)
+    return Alignment(
+        origin, move, covariance, scale_covariance, tuple(results), tuple(gains), used_equations, notes=notes
+    )
 
 
 def _solver(design: Array, one: DatumEquations, fit: DatumFit, scale_std: float | None) -> Array:

@@ -9,7 +9,14 @@ from numpy.typing import NDArray
 
 from arview.geometry import Array
 from arview.measurement.datums.directions import shift_origin
-from arview.measurement.datums.equations import AlignmentOptions, DatumEquations, DatumNotMeasuredError
+from arview.measurement.datums.equations import DatumEquations, DatumNotMeasuredError
+
+MIN_POINTS = 12
+"""Agreeing offsets that a datum needs; with fewer, outliers cannot be recognised."""
+MIN_SHARE = 0.3
+"""Share of a datum that must be found; a rim seen on one side only is no circle."""
+MAX_STD_MM = 0.2
+"""Largest standard deviation of any direction that a datum locks."""
 
 _TUKEY = 4.685
 """Cut-off of Tukey's biweight in standard deviations: 95 % efficiency for normal errors."""
@@ -162,18 +169,18 @@ def block_factor(points: Array, residuals: Array, rank: int, blocks: int = 12) -
     return max(1.0, between * count / blocks / float(np.mean(residuals**2)))
 
 
-def check_covered(one: DatumEquations, options: AlignmentOptions) -> None:
+def check_covered(one: DatumEquations) -> None:
     """Check that enough of a datum was measured. Raises DatumNotMeasuredError, which names the datum."""
-    check_fit_covered(one, fit_datum(one, is_exact=False), options)
+    check_fit_covered(one, fit_datum(one, is_exact=False))
 
 
-def check_fit_covered(one: DatumEquations, fit: DatumFit, options: AlignmentOptions) -> None:
+def check_fit_covered(one: DatumEquations, fit: DatumFit) -> None:
     """Check coverage and accuracy of a fitted datum. Raises DatumNotMeasuredError, which names the datum."""
     used, name = int(fit.inliers.sum()), f"datum {one.label} ({one.feature})"
     if one.feature == "fit":
         return
-    needed = {"point": 1, "edge": 4}.get(one.feature, options.min_points)
-    if used < max(needed, round(options.min_share * one.of)):
+    needed = {"point": 1, "edge": 4}.get(one.feature, MIN_POINTS)
+    if used < max(needed, round(MIN_SHARE * one.of)):
         raise DatumNotMeasuredError(
             f"{name}: only {used} of {one.of} points on it could be measured; photograph it from more sides, in better"
             " light, or name another feature in the part file"
@@ -191,7 +198,7 @@ def check_fit_covered(one: DatumEquations, fit: DatumFit, options: AlignmentOpti
     values, vectors = np.linalg.eigh(information)
     kept = values > 1e-9 * values[-1]
     worst = float(np.sqrt((((watched @ vectors[:, kept]) ** 2) / values[kept]).sum(axis=1).max()))
-    if worst > options.max_std_mm:
+    if worst > MAX_STD_MM:
         raise DatumNotMeasuredError(
             f"{name}: its position is uncertain by {worst:.2f} mm; photograph it from more sides, or in better light"
         )

@@ -60,16 +60,6 @@ class DatumEquations:
     directions: Array | None = None
 
 
-@dataclass(frozen=True)
-class AlignmentOptions:
-    """Thresholds for accepting a datum, and the uncertainty of its form."""
-
-    min_points: int = 12  # agreeing offsets that a datum needs; with fewer, outliers cannot be recognised
-    min_share: float = 0.3  # share of a datum that must be found; a rim seen on one side only is no circle
-    form_mm: float = 0.005  # standard uncertainty of a feature's position by its form: fine machining
-    max_std_mm: float = 0.2  # largest standard deviation of any direction that a datum locks
-
-
 def point_from_move(arms: Array) -> Array:
     """(N,3,7) derivative of the displacement ω × a + t + s a by (ω, t, s), for arms a (N,3) from the origin."""
     rows = np.zeros((len(arms), 3, 7))
@@ -83,13 +73,30 @@ def point_from_move(arms: Array) -> Array:
 
 
 def surface_equations(
-    label: str, feature: str, points: Array, normals: Array, offsets_mm: Array, variances: Array,
-    of: int | None = None, by_radius: Array | None = None, locks: tuple[str, ...] = DOF_NAMES,
-) -> DatumEquations:  # fmt: skip
+    label: str,
+    feature: str,
+    points: Array,
+    normals: Array,
+    offsets_mm: Array,
+    variances: Array,
+    of: int | None = None,
+    by_radius: Array | None = None,
+    locks: tuple[str, ...] = DOF_NAMES,
+) -> DatumEquations:
     """Equations of offsets (N,) along unit normals (N,3) at points (N,3) of the model; see `DatumEquations`."""
     rows = np.einsum("ni,nij->nj", normals, point_from_move(points))
     count = len(points) if of is None else of
-    return DatumEquations(label, feature, rows, offsets_mm, variances, points, count, by_radius, locks)
+    return DatumEquations(
+        label,
+        feature,
+        rows,
+        offsets_mm=offsets_mm,
+        variances=variances,
+        points=points,
+        of=count,
+        by_radius=by_radius,
+        locks=locks,
+    )
 
 
 def move_equations(label: str, move: Move, locks: tuple[str, ...] = DOF_NAMES) -> tuple[DatumEquations, Array]:

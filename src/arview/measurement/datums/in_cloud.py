@@ -21,7 +21,7 @@ from arview.measurement.datums.equations import (
     move_equations,
     surface_equations,
 )
-from arview.measurement.datums.options import DatumOptions
+from arview.measurement.datums.options import CLEAR_MM, MIN_CLEAR_MM, POINT_RADIUS_MM, REACH_MM
 from arview.measurement.photo.patches import near_others
 from arview.measurement.types import Move
 from arview.reconstruction.types import DenseCloud
@@ -41,9 +41,11 @@ _EDGE_BAND_MM = (2.0, 15.0)
 
 
 def measure_datums_in_cloud(
-    datums: tuple[Datum, ...], model: Model, cloud: DenseCloud, moves: Mapping[str, Move],
-    options: DatumOptions | None = None,
-) -> list[DatumEquations]:  # fmt: skip
+    datums: tuple[Datum, ...],
+    model: Model,
+    cloud: DenseCloud,
+    moves: Mapping[str, Move],
+) -> list[DatumEquations]:
     """Measure the offsets of each datum feature in a cloud.
 
     Args:
@@ -51,21 +53,17 @@ def measure_datums_in_cloud(
         model: the nominal CAD.
         cloud: of the part, in mm, within about a millimetre of the frame of the CAD.
         moves: best fits of components, for datums with the feature ``fit``.
-        options: search range and distance from other components.
 
     Raises:
         InputError: the CAD has no such feature, or the cloud does not cover it; the message names the datum.
     """
-    o = options or DatumOptions()
     if not datums:
         return []
     points = prepare_cloud(cloud, model.bounds_in_model + np.array([[-5.0], [5.0]]), _GRID_MM, _MIN_CLOUD_POINTS)
-    return [_measure(datum, model, points, moves, o) for datum in datums]
+    return [_measure(datum, model, points, moves) for datum in datums]
 
 
-def _measure(
-    datum: Datum, model: Model, cloud: CloudPoints, moves: Mapping[str, Move], o: DatumOptions
-) -> DatumEquations:
+def _measure(datum: Datum, model: Model, cloud: CloudPoints, moves: Mapping[str, Move]) -> DatumEquations:
     """Offsets of one datum, by the method for its feature."""
     if datum.feature == "fit":
         if datum.component not in moves:
@@ -73,12 +71,12 @@ def _measure(
         return move_equations(datum.label, moves[datum.component], datum.locks)[0]
     component = model.component(datum.component)
     if datum.feature == "edge":
-        return _measure_edge(datum, model, cloud, o)
+        return _measure_edge(datum, model, cloud)
     is_round = datum.feature in ("hole", "pin", "cylinder")
     faces, side = round_faces(component, datum) if is_round else (flat_faces(component, datum), 0.0)
-    near, offsets, normals = _offsets(datum, model, cloud, faces, o)
+    near, offsets, normals = _offsets(datum, model, cloud, faces)
     if datum.feature == "point":
-        around = np.linalg.norm(near.points - np.array(datum.point_in_model), axis=1) < o.point_radius_mm
+        around = np.linalg.norm(near.points - np.array(datum.point_in_model), axis=1) < POINT_RADIUS_MM
         near, offsets, normals = near.only(around), offsets[around], normals[around]
     _check(datum, len(offsets))
     if datum.feature in ("hole", "pin"):  # a short bore does not determine the tilt of its axis
@@ -87,7 +85,15 @@ def _measure(
     radius = np.full(len(offsets), side) if is_round else None
     variances = near.sigma**2
     equations = surface_equations(
-        datum.label, datum.feature, near.points, normals, offsets, variances, None, radius, datum.locks
+        datum.label,
+        datum.feature,
+        near.points,
+        normals=normals,
+        offsets_mm=offsets,
+        variances=variances,
+        of=None,
+        by_radius=radius,
+        locks=datum.locks,
     )
     if radius is None:
         return equations
@@ -99,21 +105,21 @@ def _measure(
 
 
 def _offsets(
-    datum: Datum, model: Model, cloud: CloudPoints, faces: NDArray[np.bool_], o: DatumOptions
+    datum: Datum, model: Model, cloud: CloudPoints, faces: NDArray[np.bool_]
 ) -> tuple[CloudPoints, Array, Array]:
     """Points near some faces of the datum's component, their signed distances, and the faces' normals there."""
     component = model.component(datum.component)
     surface = MeshSurface(component.vertices_in_model, component.faces)
-    low, high = component.bounds_in_model[0] - o.reach_mm, component.bounds_in_model[1] + o.reach_mm
+    low, high = component.bounds_in_model[0] - REACH_MM, component.bounds_in_model[1] + REACH_MM
     near = cloud.only(np.all((cloud.points > low) & (cloud.points < high), axis=1))
-    closest = surface.closest(near.points, o.reach_mm)
+    closest = surface.closest(near.points, REACH_MM)
     mine = (closest.faces >= 0) & ~closest.is_edge
     mine[mine] &= faces[closest.faces[mine]]
     facing = np.sum(near.normals * np.nan_to_num(closest.normals), axis=1)
     mine &= (facing > 0.5) | ~near.normals.any(axis=1)
     chosen = np.flatnonzero(mine)
     index = model.index(datum.component)
-    for clear_mm in (o.clear_mm, o.min_clear_mm):
+    for clear_mm in (CLEAR_MM, MIN_CLEAR_MM):
         clear = chosen[~near_others(near.points[chosen], model, index, clear_mm)] if len(chosen) else chosen
         if len(clear) >= min(300, 0.3 * len(chosen)):
             break
@@ -122,7 +128,7 @@ def _offsets(
     return near.only(clear), closest.distances[clear], closest.normals[clear]
 
 
-def _measure_edge(datum: Datum, model: Model, cloud: CloudPoints, o: DatumOptions) -> DatumEquations:
+def _measure_edge(datum: Datum, model: Model, cloud: CloudPoints) -> DatumEquations:
     """The line in which planes through both faces of an edge meet: each plane's offset at two places along the edge."""
     line = edge_line(model.component(datum.component), datum)
     ends = line.points(2, 0.25 * float(np.linalg.norm(line.end - line.start)))
@@ -130,7 +136,7 @@ def _measure_edge(datum: Datum, model: Model, cloud: CloudPoints, o: DatumOption
     for normal in line.normals:
         x, y, z = (float(v) for v in normal)
         face = Datum(datum.label, "plane", datum.component, datum.point_in_model, (x, y, z))
-        near, offsets, _ = _offsets(datum, model, cloud, flat_faces(model.component(datum.component), face), o)
+        near, offsets, _ = _offsets(datum, model, cloud, flat_faces(model.component(datum.component), face))
         from_line = near.points - line.start
         across = from_line @ np.cross(normal, line.direction)
         band = (np.abs(across) > _EDGE_BAND_MM[0]) & (np.abs(across) < _EDGE_BAND_MM[1])
@@ -151,7 +157,15 @@ def _measure_edge(datum: Datum, model: Model, cloud: CloudPoints, o: DatumOption
         parts.append((at @ (solver @ offsets[band]), spread, np.tile(normal, (2, 1))))
     offsets, variances, normals = (np.concatenate(column) for column in zip(*parts, strict=True))
     return surface_equations(
-        datum.label, "edge", np.tile(ends, (2, 1)), normals, offsets, variances, None, None, datum.locks
+        datum.label,
+        "edge",
+        np.tile(ends, (2, 1)),
+        normals=normals,
+        offsets_mm=offsets,
+        variances=variances,
+        of=None,
+        by_radius=None,
+        locks=datum.locks,
     )
 
 

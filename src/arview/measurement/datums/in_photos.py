@@ -21,24 +21,30 @@ from arview.measurement.datums.equations import (
     move_equations,
     surface_equations,
 )
-from arview.measurement.datums.options import DatumOptions
-from arview.measurement.datums.plane_edges import measure_plane_by_edges
+from arview.measurement.datums.options import CLEAR_MM, MIN_CLEAR_MM, POINT_RADIUS_MM, REACH_MM
+from arview.measurement.datums.plane_edges import DATUM_EDGE_PX, FINE_REACH_PX, RIVAL_PX, measure_plane_by_edges
 from arview.measurement.datums.planes import inside_triangles, plane_neighbours, plane_samples
 from arview.measurement.datums.rims import Rim, find_rim
 from arview.measurement.datums.roundness import rim_shift_mm, waves
-from arview.measurement.photo.edges import edge_offsets
+from arview.measurement.photo.edges import HALF_SLOPE, MIN_POINTS, edge_offsets
 from arview.measurement.photo.patches import near_edges, near_others, tangents_of
 from arview.measurement.photo.rival_edges import EdgePoints
-from arview.measurement.photo.sweep import sweep_offsets
+from arview.measurement.photo.sweep import MIN_SAMPLES, MIN_SIGMA_MM, MIN_VIEWS, PATCH_PX, SWEEP_EDGE_PX, sweep_offsets
 from arview.measurement.photo.views import PhotoViews
 from arview.measurement.types import Move
+
+SAMPLES = 500
+"""On a plane; errors of denser samples are correlated."""
+RIM_POINTS = 120
+"""Around a hole; about one px apart on small ones."""
+RIM_PX = 0.04
+"""Expected standard uncertainty of a rim's position by rust, chalk and burrs beside it."""
 
 
 def measure_datums_in_photos(
     datums: tuple[Datum, ...],
     views: PhotoViews,
     moves: Mapping[str, Move],
-    options: DatumOptions | None = None,
 ) -> list[DatumEquations]:
     """Measure the offsets of each datum feature, in order of precedence.
 
@@ -46,69 +52,67 @@ def measure_datums_in_photos(
         datums: of the part file.
         views: photos in the rough frame of the model.
         moves: best fits of components, for datums with the feature ``fit``.
-        options: see `DatumOptions`.
 
     Raises:
         InputError: the CAD has no such feature, or too few photos show it; the message names the datum.
     """
-    options = options or DatumOptions()
-    return [_measure(datum, views, moves, options) for datum in datums]
+    return [_measure(datum, views, moves) for datum in datums]
 
 
-def _measure(datum: Datum, views: PhotoViews, moves: Mapping[str, Move], o: DatumOptions) -> DatumEquations:
+def _measure(datum: Datum, views: PhotoViews, moves: Mapping[str, Move]) -> DatumEquations:
     """Offsets of one datum, by the method for its feature."""
     if datum.feature == "fit":
         if datum.component not in moves:
             raise DatumNotMeasuredError(f"datum {datum.label}: {datum.component!r} could not be measured as a whole")
         return move_equations(datum.label, moves[datum.component], datum.locks)[0]
     if datum.feature in ("hole", "pin"):
-        return _measure_rim(datum, views, o)
+        return _measure_rim(datum, views)
     if datum.feature == "cylinder":
-        return _measure_cylinder(datum, views, o)
+        return _measure_cylinder(datum, views)
     if datum.feature == "edge":
-        return _measure_edge(datum, views, o)
+        return _measure_edge(datum, views)
     try:
-        by_surface = _measure_flat(datum, views, o)
+        by_surface = _measure_flat(datum, views)
         if datum.feature == "plane":
-            check_covered(by_surface, o.alignment)
+            check_covered(by_surface)
         return by_surface
     except DatumNotMeasuredError as error:
         if datum.feature != "plane":
             raise
         try:
-            return measure_plane_by_edges(datum, views, o, moves.get(datum.component))
+            return measure_plane_by_edges(datum, views, moves.get(datum.component))
         except DatumNotMeasuredError as by_edges:
             reason = str(by_edges).removeprefix(f"datum {datum.label} ({datum.feature}): ")
             raise DatumNotMeasuredError(f"{error}; nor by its edges: {reason}") from by_edges
 
 
-def _measure_flat(datum: Datum, views: PhotoViews, o: DatumOptions) -> DatumEquations:
+def _measure_flat(datum: Datum, views: PhotoViews) -> DatumEquations:
     """Offsets of the flat faces of a plane, or of the disc around a point, by the sweep."""
     component = views.model.component(datum.component)
-    radius_mm = o.point_radius_mm if datum.feature == "point" else None
-    points = plane_samples(component, datum, o.samples, radius_mm)
+    radius_mm = POINT_RADIUS_MM if datum.feature == "point" else None
+    points = plane_samples(component, datum, SAMPLES, radius_mm)
     if not len(points):
         raise InputError(f"datum {datum.label}: {datum.component!r} has no flat face at {list(datum.point_in_model)}")
-    points = _clear(points, views, component, datum, o)
+    points = _clear(points, views, component, datum)
     if not len(points):
         raise DatumNotMeasuredError(
-            f"datum {datum.label} ({datum.feature}): none of it is {o.min_clear_mm:g} mm clear of other components"
+            f"datum {datum.label} ({datum.feature}): none of it is {MIN_CLEAR_MM:g} mm clear of other components"
         )
     normals = np.tile(np.array(datum.direction_in_model), (len(points), 1))
     index = views.model.index(datum.component)
-    found = sweep_offsets(points, normals, views, o.reach_mm, o.sweep, index)
-    ok, seen = found.is_ok, int(np.count_nonzero((found.views >= 0).sum(axis=1) >= o.sweep.min_views))
-    variances = found.variances_mm2[ok] + o.sweep.min_sigma_mm**2
+    found = sweep_offsets(points, normals, views, REACH_MM, index)
+    ok, seen = found.is_ok, int(np.count_nonzero((found.views >= 0).sum(axis=1) >= MIN_VIEWS))
+    variances = found.variances_mm2[ok] + MIN_SIGMA_MM**2
     return surface_equations(
         datum.label, datum.feature, points[ok], normals[ok], found.offsets_mm[ok], variances, seen, locks=datum.locks
     )
 
 
-def _clear(points: Array, views: PhotoViews, component: Component, datum: Datum, o: DatumOptions) -> Array:
+def _clear(points: Array, views: PhotoViews, component: Component, datum: Datum) -> Array:
     """The points away from other components and from the borders of the face, as far as there is room."""
     index = views.model.index(datum.component)
-    patch_mm = 0.5 * o.sweep.patch_px * views.mm_per_px(points.mean(axis=0))
-    for clear_mm in (o.clear_mm, o.min_clear_mm):
+    patch_mm = 0.5 * PATCH_PX * views.mm_per_px(points.mean(axis=0))
+    for clear_mm in (CLEAR_MM, MIN_CLEAR_MM):
         kept = points[~near_others(points, views.model, index, clear_mm)]
         if len(kept) >= min(100, 0.3 * len(points)):
             break
@@ -126,13 +130,13 @@ def _clear(points: Array, views: PhotoViews, component: Component, datum: Datum,
     return kept[whole] if np.count_nonzero(whole) >= 20 else kept
 
 
-def _measure_rim(datum: Datum, views: PhotoViews, o: DatumOptions) -> DatumEquations:
+def _measure_rim(datum: Datum, views: PhotoViews) -> DatumEquations:
     """Steps of brightness across the rim of a hole or pin; its radius is fitted too."""
     center = np.array(datum.point_in_model)
     toward = views.centres.mean(axis=0) - center
     rim = find_rim(views.model, datum, toward)
-    points, radial, tangents = rim.points(o.rim_points)
-    seen_from = _rim_views(views, rim, points, radial, o)
+    points, radial, tangents = rim.points(RIM_POINTS)
+    seen_from = _rim_views(views, rim, points, radial)
     which, view = np.nonzero(seen_from)
     if len(np.unique(view)) < 3:
         raise DatumNotMeasuredError(
@@ -147,13 +151,20 @@ def _measure_rim(datum: Datum, views: PhotoViews, o: DatumOptions) -> DatumEquat
     def design_of(directions: Array, ok: NDArray[np.bool_]) -> Array:
         return np.concatenate([directions, np.sum(directions * radial[which[ok]], axis=1)[:, None]], axis=1)
 
-    steps = _find_steps(datum, views, edges_at, design_of, 4, px_mm, o)
+    steps = _find_steps(datum, views, edges_at, design_of, 4, px_mm)
     equations = surface_equations(
-        datum.label, datum.feature, points[which[steps.ok]], steps.directions, steps.offsets, steps.variances,
-        len(which), steps.design[:, 3], datum.locks,
-    )  # fmt: skip
+        datum.label,
+        datum.feature,
+        points[which[steps.ok]],
+        normals=steps.directions,
+        offsets_mm=steps.offsets,
+        variances=steps.variances,
+        of=len(which),
+        by_radius=steps.design[:, 3],
+        locks=datum.locks,
+    )
     angles = (np.arange(len(points)) * 2 * np.pi / len(points))[which[steps.ok]]
-    shift_mm = rim_shift_mm(steps.design, steps.offsets, steps.variances, angles, o.rim_px * px_mm)
+    shift_mm = rim_shift_mm(steps.design, steps.offsets, steps.variances, angles, RIM_PX * px_mm)
     return replace(equations, form_mm=shift_mm, by_form=waves(steps.design[:, 3], angles))
 
 
@@ -177,10 +188,14 @@ class _Steps:
 
 
 def _find_steps(
-    datum: Datum, views: PhotoViews, edges_at: Callable[[Array], tuple[EdgePoints, Array]],
-    design_of: Callable[[Array, NDArray[np.bool_]], Array], unknowns: int, px_mm: float, o: DatumOptions,
+    datum: Datum,
+    views: PhotoViews,
+    edges_at: Callable[[Array], tuple[EdgePoints, Array]],
+    design_of: Callable[[Array, NDArray[np.bool_]], Array],
+    unknowns: int,
+    px_mm: float,
     rcond: float = 1e-15,
-) -> _Steps:  # fmt: skip
+) -> _Steps:
     """Search for steps three times: once over a wide range, then around the place that the previous search gave.
 
     Args:
@@ -190,24 +205,23 @@ def _find_steps(
         design_of: maps directions (K,3), and which points they are at, to the derivative (K,U) of the offsets.
         unknowns: U.
         px_mm: size of a pixel.
-        o: search ranges.
         rcond: unknowns whose relative information is below this stay at zero.
 
     Raises:
         InputError: too few steps were found.
     """
     place = np.zeros(unknowns)
-    for reach_px in (o.reach_mm / px_mm + 2.0, o.fine_reach_px, o.fine_reach_px):
+    for reach_px in (REACH_MM / px_mm + 2.0, FINE_REACH_PX, FINE_REACH_PX):
         edges, inside = edges_at(place)
-        found = edge_offsets(edges, inside, views, reach_px, o.edges)
+        found = edge_offsets(edges, inside, views, reach_px)
         ok = found.seen & (found.slopes != 0.0)
-        if np.count_nonzero(ok) < o.edges.min_points:
+        if np.count_nonzero(ok) < MIN_POINTS:
             raise DatumNotMeasuredError(
                 f"datum {datum.label} ({datum.feature}): its edge was found at only {np.count_nonzero(ok)} of"
                 f" {len(ok)} places; is it filled, or covered?"
             )
         directions, slope = found.directions[ok], np.abs(found.slopes[ok])
-        variances = (0.3 * found.mm_per_px[ok]) ** 2 * (slope + o.edges.half_slope) / slope
+        variances = (0.3 * found.mm_per_px[ok]) ** 2 * (slope + HALF_SLOPE) / slope
         design = design_of(directions, ok)
         offsets = found.offsets_mm[ok] + design @ place
         share, _ = robust_weights(design, offsets, variances)
@@ -216,9 +230,9 @@ def _find_steps(
     return _Steps(ok, directions, offsets, variances, design)
 
 
-def _rim_views(views: PhotoViews, rim: Rim, points: Array, radial: Array, o: DatumOptions) -> NDArray[np.bool_]:
+def _rim_views(views: PhotoViews, rim: Rim, points: Array, radial: Array) -> NDArray[np.bool_]:
     """(N,M) which photos show which points of a rim without another edge near them."""
-    other = rim.points(o.rim_points, other=True)[0]
+    other = rim.points(RIM_POINTS, other=True)[0]
     groups = (points + 0.3 * radial + 0.05 * rim.axis)[:, None]
     result = np.zeros((len(points), len(views.cameras)), dtype=bool)
     for index, camera in enumerate(views.cameras):
@@ -233,7 +247,7 @@ def _rim_views(views: PhotoViews, rim: Rim, points: Array, radial: Array, o: Dat
         shown = _seen_through(rim, other, views.centres[index])
         apart = np.linalg.norm(pixels[:, None] - rivals[None], axis=2)
         apart = np.where(shown[None], apart, np.inf).min(axis=1)
-        result[:, index] = visible & (apart > o.rival_px)
+        result[:, index] = visible & (apart > RIVAL_PX)
     return result
 
 
@@ -250,37 +264,44 @@ def _seen_through(rim: Rim, other: Array, eye: Array) -> NDArray[np.bool_]:
 # --- cylinders and edges ---------------------------------------------------------------------------------
 
 
-def _measure_cylinder(datum: Datum, views: PhotoViews, o: DatumOptions) -> DatumEquations:
+def _measure_cylinder(datum: Datum, views: PhotoViews) -> DatumEquations:
     """Offsets of the round faces by the sweep with curved patches; the radius is fitted and discarded."""
     component, index = views.model.component(datum.component), views.model.index(datum.component)
     faces, side = round_faces(component, datum)
     px_mm = views.mm_per_px(np.array(datum.point_in_model))
-    samples = sample_surface(replace(component, faces=component.faces[faces]), 3.0 * px_mm, o.samples)
-    apart = ~near_others(samples.points, views.model, index, o.min_clear_mm)
-    samples = samples.of(apart & ~near_edges(samples.points, component, o.sweep.edge_px * px_mm))
-    if len(samples.points) < o.sweep.min_samples:
+    samples = sample_surface(replace(component, faces=component.faces[faces]), 3.0 * px_mm, SAMPLES)
+    apart = ~near_others(samples.points, views.model, index, MIN_CLEAR_MM)
+    samples = samples.of(apart & ~near_edges(samples.points, component, SWEEP_EDGE_PX * px_mm))
+    if len(samples.points) < MIN_SAMPLES:
         raise DatumNotMeasuredError(
             f"datum {datum.label} (cylinder): too little of it is clear of edges and other components"
         )
-    found = sweep_offsets(samples.points, samples.normals, views, o.reach_mm, o.sweep, index)
-    ok, seen = found.is_ok, int(np.count_nonzero((found.views >= 0).sum(axis=1) >= o.sweep.min_views))
+    found = sweep_offsets(samples.points, samples.normals, views, REACH_MM, index)
+    ok, seen = found.is_ok, int(np.count_nonzero((found.views >= 0).sum(axis=1) >= MIN_VIEWS))
     axis = np.array(datum.direction_in_model)
     radial = samples.points - np.array(datum.point_in_model)
     radial = side * (radial - (radial @ axis)[:, None] * axis)
     radial /= np.linalg.norm(radial, axis=1, keepdims=True)
-    variances = found.variances_mm2 + o.sweep.min_sigma_mm**2
+    variances = found.variances_mm2 + MIN_SIGMA_MM**2
     return surface_equations(
-        datum.label, "cylinder", samples.points[ok], radial[ok], found.offsets_mm[ok], variances[ok], seen,
-        np.full(np.count_nonzero(ok), side), datum.locks,
-    )  # fmt: skip
+        datum.label,
+        "cylinder",
+        samples.points[ok],
+        normals=radial[ok],
+        offsets_mm=found.offsets_mm[ok],
+        variances=variances[ok],
+        of=seen,
+        by_radius=np.full(np.count_nonzero(ok), side),
+        locks=datum.locks,
+    )
 
 
-def _measure_edge(datum: Datum, views: PhotoViews, o: DatumOptions) -> DatumEquations:
+def _measure_edge(datum: Datum, views: PhotoViews) -> DatumEquations:
     """Steps of brightness across a straight edge, in all photos that show it."""
     line = edge_line(views.model.component(datum.component), datum)
     px_mm = views.mm_per_px(0.5 * (line.start + line.end))
-    points = line.points(o.rim_points, 6.0 * px_mm)
-    points = points[~near_others(points, views.model, views.model.index(datum.component), o.min_clear_mm)]
+    points = line.points(RIM_POINTS, 6.0 * px_mm)
+    points = points[~near_others(points, views.model, views.model.index(datum.component), MIN_CLEAR_MM)]
     groups = (points + 0.05 * line.normals.sum(axis=0))[:, None]
     seen = np.zeros((len(points), len(views.cameras)), dtype=bool)
     for index in range(len(views.cameras)):
@@ -294,11 +315,23 @@ def _measure_edge(datum: Datum, views: PhotoViews, o: DatumOptions) -> DatumEqua
     inside = 0.5 * (line.start + line.end) - 10.0 * line.normals.sum(axis=0)
     tangents = np.tile(line.direction, (len(which), 1))
     steps = _find_steps(
-        datum, views, lambda shift: (EdgePoints(points[which] + shift, tangents, view), inside),
-        lambda directions, _: directions @ project, 3, px_mm, o, rcond=1e-6,
-    )  # fmt: skip
+        datum,
+        views,
+        lambda shift: (EdgePoints(points[which] + shift, tangents, view), inside),
+        lambda directions, _: directions @ project,
+        3,
+        px_mm,
+        rcond=1e-6,
+    )
     equations = surface_equations(
-        datum.label, "edge", points[which[steps.ok]], steps.directions, steps.offsets, steps.variances, len(which),
-        None, datum.locks,
-    )  # fmt: skip
-    return replace(equations, form_mm=o.edge_px * px_mm)
+        datum.label,
+        "edge",
+        points[which[steps.ok]],
+        normals=steps.directions,
+        offsets_mm=steps.offsets,
+        variances=steps.variances,
+        of=len(which),
+        by_radius=None,
+        locks=datum.locks,
+    )
+    return replace(equations, form_mm=DATUM_EDGE_PX * px_mm)

@@ -13,19 +13,17 @@ from arview.cad.part import Datum, DatumFeature
 from arview.errors import InputError
 from arview.inspection import FailedDatum
 from arview.measurement.datums.datum_fit import check_covered
-from arview.measurement.datums.equations import AlignmentOptions, DatumEquations, DatumNotMeasuredError
+from arview.measurement.datums.equations import DatumEquations, DatumNotMeasuredError
 from arview.measurement.datums.plane_edges import plane_directions
 
 MeasureDatum = Callable[[Datum], DatumEquations]
 """Measures one datum, or raises InputError."""
 
 
-@dataclass(frozen=True)
-class PartialOptions:
-    """How many other features are tried where a datum could not be measured."""
-
-    tried: int = 4  # other features measured for each datum; each takes about a second
-    min_face_share: float = 0.05  # of the component's area, for a face that can be a datum
+TRIED = 4
+"""Other features measured for each datum; each takes about a second."""
+MIN_FACE_SHARE = 0.05
+"""Of the component's area, for a face that can be a datum."""
 
 
 @dataclass(frozen=True)
@@ -43,9 +41,11 @@ class MeasuredDatums:
 
 
 def measure_each(
-    datums: Sequence[Datum], measure: MeasureDatum, model: Model, rest: DatumEquations | None,
-    alignment: AlignmentOptions, options: PartialOptions | None = None,
-) -> MeasuredDatums:  # fmt: skip
+    datums: Sequence[Datum],
+    measure: MeasureDatum,
+    model: Model,
+    rest: DatumEquations | None,
+) -> MeasuredDatums:
     """Measure the datums in their order of precedence; one that fails does not stop the others.
 
     Args:
@@ -53,19 +53,16 @@ def measure_each(
         measure: measures one datum.
         model: the nominal CAD.
         rest: best fit of the base, or None.
-        alignment: thresholds for accepting a datum.
-        options: see `PartialOptions`.
 
     Raises:
         InputError: a datum is not in the CAD.
     """
-    options = options or PartialOptions()
     equations: list[DatumEquations] = []
     failed: list[FailedDatum] = []
 
     def checked(datum: Datum) -> DatumEquations:
         found = measure(datum)
-        check_covered(found, alignment)
+        check_covered(found)
         return found
 
     for datum in datums:
@@ -73,7 +70,7 @@ def measure_each(
             equations.append(checked(datum))
         except DatumNotMeasuredError as error:
             reason = str(error).removeprefix(f"datum {datum.label} ({datum.feature}): ")
-            instead = _alternatives(datum, model.component(datum.component), checked, options)
+            instead = _alternatives(datum, model.component(datum.component), checked)
             if rest is not None:
                 instead.append(f'best fit of {rest.label} (feature = "fit")')
             directions = ""
@@ -85,13 +82,13 @@ def measure_each(
     return MeasuredDatums(equations, tuple(failed))
 
 
-def _alternatives(datum: Datum, component: Component, measure: MeasureDatum, options: PartialOptions) -> list[str]:
+def _alternatives(datum: Datum, component: Component, measure: MeasureDatum) -> list[str]:
     """Other features of a component that could be measured in the place of a datum, as texts."""
-    candidates = _other_planes(datum, component, options) if datum.feature in ("plane", "point") else []
+    candidates = _other_planes(datum, component) if datum.feature in ("plane", "point") else []
     if datum.feature in ("hole", "pin", "cylinder"):
         candidates = _other_holes(datum, component)
     texts = []
-    for candidate in candidates[: options.tried]:
+    for candidate in candidates[:TRIED]:
         try:
             measure(candidate)
         except InputError:
@@ -102,7 +99,7 @@ def _alternatives(datum: Datum, component: Component, measure: MeasureDatum, opt
     return texts
 
 
-def _other_planes(datum: Datum, component: Component, options: PartialOptions) -> list[Datum]:
+def _other_planes(datum: Datum, component: Component) -> list[Datum]:
     """The largest other flat faces of a component, those with the datum's direction first."""
     corners = component.vertices_in_model[component.faces]
     doubled = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -114,7 +111,7 @@ def _other_planes(datum: Datum, component: Component, options: PartialOptions) -
     of_group = np.bincount(owner.ravel(), weights=areas, minlength=len(groups))
     wanted, point = np.array(datum.direction_in_model), np.array(datum.point_in_model)
     found = []
-    for group in np.flatnonzero(of_group > options.min_face_share * areas.sum()):
+    for group in np.flatnonzero(of_group > MIN_FACE_SHARE * areas.sum()):
         face = np.flatnonzero(owner.ravel() == group)
         normal = doubled[face].sum(axis=0) / np.linalg.norm(doubled[face].sum(axis=0))
         middle = np.average(corners[face].mean(axis=1), axis=0, weights=areas[face])
@@ -135,8 +132,9 @@ def _other_holes(datum: Datum, component: Component) -> list[Datum]:
     for rim in find_rims(component):
         arm = rim.center_in_model - point
         aside = float(np.linalg.norm(arm - axis * (axis @ arm)))
-        is_known = any(np.linalg.norm(np.cross(np.array(o.point_in_model) - rim.center_in_model, axis)) < 0.1
-                       for _, o in found)  # fmt: skip
+        is_known = any(
+            np.linalg.norm(np.cross(np.array(o.point_in_model) - rim.center_in_model, axis)) < 0.1 for _, o in found
+        )
         if abs(float(rim.axis_in_model @ axis)) < 0.999 or aside < 0.5 * rim.radius_mm or is_known:
             continue
         x, y, z = rim.center_in_model.tolist()

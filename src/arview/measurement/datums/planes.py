@@ -75,8 +75,10 @@ def inside_triangles(places: Array, triangles: Array) -> NDArray[np.bool_]:
     """(N,) which points (N,2) lie in any of the triangles (T,3,2)."""
     result = np.zeros(len(places), dtype=bool)
     for a, b, c in triangles:
-        sides = [(q[0] - p[0]) * (places[:, 1] - p[1]) - (q[1] - p[1]) * (places[:, 0] - p[0])
-                 for p, q in ((a, b), (b, c), (c, a))]  # fmt: skip
+        sides = [
+            (q[0] - p[0]) * (places[:, 1] - p[1]) - (q[1] - p[1]) * (places[:, 0] - p[0])
+            for p, q in ((a, b), (b, c), (c, a))
+        ]
         result |= (np.min(sides, axis=0) >= 0) | (np.max(sides, axis=0) <= 0)
     return result
 

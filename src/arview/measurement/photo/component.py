@@ -7,7 +7,6 @@ import numpy as np
 from arview.cad.part import Part
 from arview.geometry import Array, apply, exp_so3, log_so3, rigid
 from arview.measurement.photo.fit import RigidFit
-from arview.measurement.photo.options import PhotoOptions
 from arview.measurement.photo.patches import free_directions, turning_center
 from arview.measurement.photo.views import PhotoViews
 from arview.measurement.types import Method, Move
@@ -19,7 +18,7 @@ class MeasuredComponent:
     A *place* is the (4,4) matrix ``measured_from_nominal`` in the model frame.
 
     Attributes:
-        views, index, options: as given.
+        views, index: as given.
         shape: the component's mesh.
         center: (3,) its centre of mass, mm; on the declared axis of what is round.
         corners: (8,3) corners of its bounding box, mm.
@@ -28,8 +27,8 @@ class MeasuredComponent:
         free: (K,6) motions that leave its shape unchanged, see `free_directions`.
     """
 
-    def __init__(self, views: PhotoViews, index: int, part: Part | None, options: PhotoOptions) -> None:
-        self.views, self.index, self.options = views, index, options
+    def __init__(self, views: PhotoViews, index: int, part: Part | None) -> None:
+        self.views, self.index = views, index
         self.shape = views.model.components[index]
         low, high = self.shape.bounds_in_model
         self.center = turning_center(self.shape, part)
@@ -65,9 +64,15 @@ class MeasuredComponent:
         return np.asarray(grid[np.argsort(np.linalg.norm(grid, axis=1), kind="stable")])
 
     def move(
-        self, method: Method, fit: RigidFit, by_poses: Array, place: Array, systematic_mm: float, support: float,
+        self,
+        method: Method,
+        fit: RigidFit,
+        by_poses: Array,
+        place: Array,
+        systematic_mm: float,
+        support: float,
         common: Array | None = None,
-    ) -> Move:  # fmt: skip
+    ) -> Move:
         """The measured move from the last fit.
 
         Args:

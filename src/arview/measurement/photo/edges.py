@@ -20,11 +20,50 @@ from arview.geometry import Array, apply, invert, rigid
 from arview.guideviews.mesh_edges import EDGE_CREASE, EDGE_SILHOUETTE, mesh_edges, sample_visible_edges
 from arview.measurement.photo.component import MeasuredComponent
 from arview.measurement.photo.fit import RigidFit, fit_rigid, move_rows
-from arview.measurement.photo.options import EdgeOptions
+from arview.measurement.photo.options import JOINT_MM, UNDETERMINED_MM
 from arview.measurement.photo.patches import near_others
 from arview.measurement.photo.rival_edges import EdgePoints, merged_shift_px, rival_offsets_px
 from arview.measurement.photo.views import PhotoViews
 from arview.measurement.types import Move, NotMeasured
+
+CAPTURE_MM = 5.0
+"""Largest displacement that the first round finds."""
+REACHES_PX: tuple[float, ...] = (6.0, 4.5, 3.5, 3.0, 3.0, 3.0)
+"""Search range across the edges in each round."""
+SPACING_PX = 3.0
+"""Distance between samples along an edge."""
+MAX_POINTS = 3000
+"""Edge points of one component in all photos; more are redundant."""
+HALF_WIDTH_PX = 2.0
+"""Profiles are averaged over this distance to either side along the edge."""
+THRESHOLD = 1.0
+"""Weakest step, in grey levels (of 255) per px in linear light."""
+HALF_SLOPE = 6.0
+"""Slope at which a step has half its full weight."""
+MIN_SIGMA_PX = 0.05
+"""Lower bound of the residuals' standard deviation: lens, tessellation, pixel response."""
+MAX_DARK_SHIFT_PX = 0.2
+"""Largest common shift of all edges towards the dark side: tone curve, glare."""
+MIN_POINTS = 40
+"""Edge points that a measurement needs."""
+MIN_DIRECTION = 0.2
+"""Share of a direction's information that must agree for it to be determined."""
+MIN_SUPPORT = 0.25
+"""Share of predicted points with a step at the fitted place, beyond chance."""
+FIRST_RIVAL_PX = 3.0
+"""In the first rounds, points with another edge nearer beside them are left out."""
+RIVAL_PX = 2.0
+"""The same in the last rounds: blur merges nearer steps."""
+RIVAL_REACH_PX = 6.0
+"""An edge farther than this is no rival: the last rounds search half as far."""
+FINE_ROUNDS = 3
+"""Number of the last rounds."""
+BLUR_PX = 1.0
+"""Standard deviation of a step's blur: lens, sensor, smoothing, and the samples of a profile."""
+FLANKED_PX = 0.5
+"""Systematic standard deviation where all edges have others beside them: half their gap."""
+SYSTEMATIC_PX = 0.03
+"""Standard deviation of a common shift of all edges of a component: chamfers, light."""
 
 
 @dataclass(frozen=True)
@@ -56,9 +95,14 @@ class EdgeOffsets:
 
 
 def edge_offsets(
-    edges: EdgePoints, center: Array, views: PhotoViews, reach_px: float, options: EdgeOptions, level: int = 0,
-    shift_px: float = 0.0, gaps_px: Array | None = None,
-) -> EdgeOffsets:  # fmt: skip
+    edges: EdgePoints,
+    center: Array,
+    views: PhotoViews,
+    reach_px: float,
+    level: int = 0,
+    shift_px: float = 0.0,
+    gaps_px: Array | None = None,
+) -> EdgeOffsets:
     """Find a step of brightness across each predicted edge point.
 
     Args:
@@ -66,7 +110,6 @@ def edge_offsets(
         center: (3,) point from which the directions lead away.
         views: the photos.
         reach_px: search range to either side, px of the level.
-        options: see `EdgeOptions`.
         level: resolution of the photos: 0 is full size, each further level half of it.
         shift_px: search this far beside the edge; what is found there is due to chance.
         gaps_px: (N,2) of `rival_offsets_px`, in px of full size; None: no edge has another one beside it.
@@ -90,7 +133,7 @@ def edge_offsets(
         normals[bad], pixels[bad], by_cam[bad], by_model[bad] = 0.0, -1e6, 0.0, [1.0, 0.0, 0.0]
         gray, corner = _crop(views, int(view), level, pixels[~bad], reach_px + abs(shift_px))
         offsets, slopes, inside = find_steps(
-            gray, pixels - corner + shift_px * normals, normals, reach_px, options.half_width_px, options.threshold
+            gray, pixels - corner + shift_px * normals, normals, reach_px, HALF_WIDTH_PX, THRESHOLD
         )
         size = np.linalg.norm(by_model, axis=1)
         mm_per_px[of], seen[of] = 1.0 / size, inside
@@ -101,10 +144,20 @@ def edge_offsets(
         hypotheses[of], strengths[of] = offsets / size[:, None], slopes
         twists[of] = np.concatenate([np.cross(in_cam, by_cam), by_cam], axis=1) / size[:, None]
     chosen, slope = choose_steps(
-        hypotheses / mm_per_px[:, None], strengths, 0.4 * reach_px, options.half_slope
+        hypotheses / mm_per_px[:, None], strengths, 0.4 * reach_px, HALF_SLOPE
     )  # in px, so that the choice does not depend on the distance
-    merged_mm = merged_shift_px(gap, options.blur_px) * mm_per_px
-    return EdgeOffsets(directions, chosen * mm_per_px, mm_per_px, slope, seen, hypotheses, strengths, twists, merged_mm)
+    merged_mm = merged_shift_px(gap, BLUR_PX) * mm_per_px
+    return EdgeOffsets(
+        directions,
+        chosen * mm_per_px,
+        mm_per_px,
+        slopes=slope,
+        seen=seen,
+        hypotheses_mm=hypotheses,
+        strengths=strengths,
+        pose_rows=twists,
+        merged_mm=merged_mm,
+    )
 
 
 def _across(camera: Camera, in_cam: Array, pixels: Array, tangents: Array) -> tuple[Array, Array]:
@@ -149,37 +202,36 @@ class ComponentEdges:
     """Measurement of one component by its edges."""
 
     def __init__(self, body: MeasuredComponent) -> None:
-        self.body, self.views, self.options = body, body.views, body.options
+        self.body, self.views = body, body.views
         self._edges = mesh_edges(make_model(body.shape.name, (body.shape,)), CREASE_DEG)
         self._predicted: tuple[Array, EdgePoints, Array] | None = None
         self._clear = (0.0, 0.0)
 
     def measure(self, start: Array | None = None) -> Move | NotMeasured:
         """Measure the component's move; ``start`` (4,4) is its approximate place, None searches around nominal."""
-        o = self.options.edges
         place = np.eye(4) if start is None else start
         flanked = self._choose_clear(place)
         edges = self.predicted(place, self._clear[0])
-        if len(edges.points) < o.min_points or len(np.unique(edges.view)) < 3:
+        if len(edges.points) < MIN_POINTS or len(np.unique(edges.view)) < 3:
             reason = "fewer than 3 photos show enough of its edges; take more photos of it"
             return NotMeasured(self.body.shape.name, "edges", reason, is_unseen=True)
         # Start on reduced pictures where a pixel is much smaller than the displacements searched for.
         levels = [k for k in (2, 1) if self.body.px_mm * 2.0**k < 0.6]
-        rounds = [(k, 6.0) for k in levels] + [(0, reach) for reach in o.reaches_px]
+        rounds = [(k, 6.0) for k in levels] + [(0, reach) for reach in REACHES_PX]
         if start is None:
             place = self._capture(edges, levels[0] if levels else 0)
         dark_mm = 0.0
         for turn, (level, reach_px) in enumerate(rounds):
             # Between near edges the nearest step is the right one only once the place is known well; a step beyond the
             # middle between an edge and its rival is the rival's.
-            is_fine = turn >= len(rounds) - o.fine_rounds
+            is_fine = turn >= len(rounds) - FINE_ROUNDS
             edges, gaps_px = self._clear_of(place, self._clear[is_fine])
             rivals = np.hypot(*gaps_px.T)
-            found = edge_offsets(edges, apply(place, self.body.center), self.views, reach_px, o, level, gaps_px=gaps_px)
+            found = edge_offsets(edges, apply(place, self.body.center), self.views, reach_px, level, gaps_px=gaps_px)
             ok = found.seen & (found.slopes != 0.0)
             if is_fine:
                 ok &= np.abs(found.offsets_mm) < 0.5 * rivals * found.mm_per_px
-            if np.count_nonzero(ok) < o.min_points:
+            if np.count_nonzero(ok) < MIN_POINTS:
                 reason = f"only {np.count_nonzero(ok)} of {len(ok)} points of its edges are seen in the photos"
                 return NotMeasured(self.body.shape.name, "edges", reason, support=self._support(edges, place))
             before, dark_before_mm = place, dark_mm
@@ -192,11 +244,11 @@ class ComponentEdges:
         place = self.body.moved(before, fit.twist)
         support = self._support(edges, place)
         used = int(np.count_nonzero(fit.weights > 0.1))
-        if support < o.min_support or used < o.min_points or len(fit.undetermined) == 6:
+        if support < MIN_SUPPORT or used < MIN_POINTS or len(fit.undetermined) == 6:
             reason = f"its edges are not seen where they should be: {100 * support:.0f} % more than by chance"
             return NotMeasured(self.body.shape.name, "edges", reason, support=support)
         by_poses = pose_gain(self.views, fit, edges.view[ok], found.pose_rows[ok])
-        systematic_px = float(np.hypot(o.systematic_px, o.flanked_px * flanked))
+        systematic_px = float(np.hypot(SYSTEMATIC_PX, FLANKED_PX * flanked))
         # Edges of one kind have steps of one kind beside them, so that they are all shifted the same way.
         merged = _RIVAL_HEIGHT_STD * fit.gain @ found.merged_mm[ok]
         return self.body.move("edges", fit, by_poses, place, systematic_px * self.body.px_mm, support, merged)
@@ -206,18 +258,17 @@ class ComponentEdges:
 
         Edges that another one runs beside are left out where the others suffice; else they are all used.
         """
-        o = self.options.edges
-        for clear in ((o.first_rival_px, o.rival_px), (o.rival_px, o.rival_px)):
+        for clear in ((FIRST_RIVAL_PX, RIVAL_PX), (RIVAL_PX, RIVAL_PX)):
             if all(self._suffices(self.predicted(place, one)) for one in clear):
                 self._clear = clear
                 return 0.0
         self._clear = (0.0, 0.0)
         every = len(self.predicted(place).points)
-        return 1.0 - len(self.predicted(place, o.rival_px).points) / max(1, every)
+        return 1.0 - len(self.predicted(place, RIVAL_PX).points) / max(1, every)
 
     def _suffices(self, edges: EdgePoints) -> bool:
         """Whether there are enough edge points, in enough photos."""
-        return len(edges.points) >= 2 * self.options.edges.min_points and len(np.unique(edges.view)) >= 3
+        return len(edges.points) >= 2 * MIN_POINTS and len(np.unique(edges.view)) >= 3
 
     def predicted(self, place: Array, clear_px: float = 0.0) -> EdgePoints:
         """Edge points that the photos should show with the component at a place; joints with others are left out.
@@ -235,7 +286,7 @@ class ComponentEdges:
         """The points of `predicted`, and (N,2) the offset of the nearest edge beside each, px; inf if far."""
         edges, gaps_px = self._all_predicted(place)
         kept = np.flatnonzero(np.hypot(*gaps_px.T) >= clear_px)
-        count = self.options.edges.max_points
+        count = MAX_POINTS
         kept = kept[:: int(np.ceil(len(kept) / count))] if len(kept) > count else kept
         return edges.of(kept), gaps_px[kept]
 
@@ -245,7 +296,6 @@ class ComponentEdges:
             before, edges, gaps_px = self._predicted
             step = place @ invert(before)
             return EdgePoints(apply(step, edges.points), edges.tangents @ step[:3, :3].T, edges.view), gaps_px
-        o = self.options.edges
         corners = apply(place, self.body.corners)
         points, tangents, views = [], [], []
         for view in range(len(self.views.cameras)):
@@ -256,9 +306,7 @@ class ComponentEdges:
             np.divide(1.0, window.inverse_depth, out=depth, where=window.inverse_depth > 0)
             fx, fy, cx, cy = window.lens
             lens = (fx, fy, cx - window.origin[0], cy - window.origin[1])
-            found = sample_visible_edges(
-                self._edges, self.views.cam_from_model[view] @ place, lens, depth, o.spacing_px
-            )
+            found = sample_visible_edges(self._edges, self.views.cam_from_model[view] @ place, lens, depth, SPACING_PX)
             good = (found.kinds & (EDGE_CREASE | EDGE_SILHOUETTE)) > 0
             points.append(found.points_in_model[good])
             tangents.append(found.tangents_in_model[good])
@@ -270,19 +318,18 @@ class ComponentEdges:
         edges = EdgePoints(
             apply(place, nominal), np.concatenate(tangents) @ place[:3, :3].T, np.concatenate(views).astype(np.int64)
         )
-        gaps_px = rival_offsets_px(edges, self.views, o.rival_reach_px)
-        apart = ~near_others(nominal, self.views.model, self.body.index, self.options.joint_mm)
+        gaps_px = rival_offsets_px(edges, self.views, RIVAL_REACH_PX)
+        apart = ~near_others(nominal, self.views.model, self.body.index, JOINT_MM)
         self._predicted = (place, edges.of(apart), gaps_px[apart])
         return self._predicted[1:]
 
     def _capture(self, edges: EdgePoints, level: int) -> Array:
         """Place within the capture range at which most edges have a step: all steps found vote for translations."""
-        o = self.options.edges
         some = edges.of(np.arange(0, len(edges.points), max(1, len(edges.points) // 800)))
         px_mm = self.body.px_mm * 2.0**level
-        found = edge_offsets(some, self.body.center, self.views, o.capture_mm / px_mm + 2.0, o, level)
-        shifts = self.body.shifts(o.capture_mm)
-        weight = np.abs(found.strengths) / (np.abs(found.strengths) + o.half_slope)
+        found = edge_offsets(some, self.body.center, self.views, CAPTURE_MM / px_mm + 2.0, level)
+        shifts = self.body.shifts(CAPTURE_MM)
+        weight = np.abs(found.strengths) / (np.abs(found.strengths) + HALF_SLOPE)
         # Strongest first, so that poor shifts are given up early.
         order = np.argsort(-weight.max(axis=1), kind="stable")
         order = order[weight[order].max(axis=1) > 0.0]
@@ -295,34 +342,44 @@ class ComponentEdges:
         return rigid(np.eye(3), best)
 
     def _fit(
-        self, edges: EdgePoints, found: EdgeOffsets, ok: NDArray[np.bool_], place: Array, dark_mm: float,
+        self,
+        edges: EdgePoints,
+        found: EdgeOffsets,
+        ok: NDArray[np.bool_],
+        place: Array,
+        dark_mm: float,
         is_last: bool = True,
-    ) -> tuple[RigidFit, float]:  # fmt: skip
+    ) -> tuple[RigidFit, float]:
         """Fit with all edges shifted to the dark side by ``dark_mm``; also return the shift for the next round."""
-        o = self.options.edges
         size, slope = found.mm_per_px[ok], found.slopes[ok]
-        sigmas = _SIGMA_PX * size * np.sqrt((np.abs(slope) + o.half_slope) / np.abs(slope))
+        sigmas = _SIGMA_PX * size * np.sqrt((np.abs(slope) + HALF_SLOPE) / np.abs(slope))
         center = apply(place, self.body.center)
         rows = move_rows(edges.points[ok], found.directions[ok], center)
         dark = np.sign(slope)
         fit = fit_rigid(
-            rows, found.offsets_mm[ok] - dark * dark_mm, sigmas, self.body.free_at(place), self.body.radius_mm,
-            self.options.undetermined_mm, edges.points[ok] / (4.0 * self.body.px_mm), o.min_sigma_px / _SIGMA_PX,
-            move_rows(edges.points[found.seen], found.directions[found.seen], center), o.min_direction,
+            rows,
+            found.offsets_mm[ok] - dark * dark_mm,
+            sigmas,
+            free=self.body.free_at(place),
+            radius_mm=self.body.radius_mm,
+            undetermined_mm=UNDETERMINED_MM,
+            places=edges.points[ok] / (4.0 * self.body.px_mm),
+            min_sigma=MIN_SIGMA_PX / _SIGMA_PX,
+            searched_rows=move_rows(edges.points[found.seen], found.directions[found.seen], center),
+            min_support=MIN_DIRECTION,
             max_pairs=len(ok) if is_last else _FEW_PAIRS,
-        )  # fmt: skip
+        )
         left = found.offsets_mm[ok] - rows @ fit.twist
-        limit = o.max_dark_shift_px * self.body.px_mm
+        limit = MAX_DARK_SHIFT_PX * self.body.px_mm
         # The denominator holds a weak prior at zero.
         shift = float(np.sum(fit.weights * dark * left) / (1.05 * np.sum(fit.weights) + 1.0))
         return fit, float(np.clip(shift, -limit, limit))
 
     def _support(self, edges: EdgePoints, place: Array) -> float:
         """Share of predicted points with a step within one pixel, beyond what is found by chance beside the edges."""
-        o = self.options.edges
         shares = []
         for shift_px in (0.0, -7.0, 7.0):
-            found = edge_offsets(edges, apply(place, self.body.center), self.views, 3.0, o, 0, shift_px)
+            found = edge_offsets(edges, apply(place, self.body.center), self.views, 3.0, 0, shift_px)
             near = found.seen & (found.slopes != 0.0) & (np.abs(found.offsets_mm) < found.mm_per_px)
             shares.append(int(np.count_nonzero(near)) / max(1, int(np.count_nonzero(found.seen))))
         chance = min(0.5 * (shares[1] + shares[2]), 0.9)
@@ -341,9 +398,13 @@ _SIGMA_PX = 0.3
 
 @kernel(numpy_errors=True)
 def _vote(
-    hypotheses: NDArray[np.float64], weights: NDArray[np.float64], directions: NDArray[np.float64],
-    shifts: NDArray[np.float64], width: float, share: float
-) -> NDArray[np.float64]:  # fmt: skip
+    hypotheses: NDArray[np.float64],
+    weights: NDArray[np.float64],
+    directions: NDArray[np.float64],
+    shifts: NDArray[np.float64],
+    width: float,
+    share: float,
+) -> NDArray[np.float64]:
     """Sum over edge points of the best step near the place to which each shift moves the edge.
 
     Args:

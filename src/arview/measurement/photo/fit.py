@@ -207,7 +207,7 @@ def _distance_bins(places: NDArray[np.float64], edges: NDArray[np.float64]) -> N
 @kernel
 def _binned_products(
     bins: NDArray[np.uint8], residuals: NDArray[np.float64], size: int
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:  # fmt: skip
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Sum of the products of pairs of residuals, and number of pairs, in each bin."""
     products, counts = np.zeros(size), np.zeros(size)
     for i in range(bins.shape[0]):
@@ -220,7 +220,7 @@ def _binned_products(
 @kernel
 def _correlated_sum(
     bins: NDArray[np.uint8], correlation: NDArray[np.float64], rows: NDArray[np.float64]
-) -> NDArray[np.float64]:  # fmt: skip
+) -> NDArray[np.float64]:
     """(B,B) sum over pairs i ≠ j of ``correlation`` times the outer product of rows i and j."""
     n, b = rows.shape
     result = np.zeros((b, b))

@@ -18,9 +18,15 @@ _MIN_POINTS = 9
 
 @kernel(fastmath=_FAST, numpy_errors=True)
 def sweep_scores(
-    patches: NDArray[np.float64], is_on: NDArray[np.bool_], shades: NDArray[np.float64], normals: NDArray[np.float64],
-    steps: NDArray[np.float64], views: NDArray[np.int64], stack: PhotoStack, min_contrast: float
-) -> tuple[NDArray[np.float32], NDArray[np.int8], NDArray[np.float32]]:  # fmt: skip
+    patches: NDArray[np.float64],
+    is_on: NDArray[np.bool_],
+    shades: NDArray[np.float64],
+    normals: NDArray[np.float64],
+    steps: NDArray[np.float64],
+    views: NDArray[np.int64],
+    stack: PhotoStack,
+    min_contrast: float,
+) -> tuple[NDArray[np.float32], NDArray[np.int8], NDArray[np.float32]]:
     """Mean correlation (ZNCC) over all pairs of views of patches moved along their normals.
 
     Args:
@@ -51,7 +57,17 @@ def sweep_scores(
     shade = np.empty((3, p_all))
     u, v = np.empty(p_all), np.empty(p_all)
     for i in range(n):
-        used = _to_cameras(patches[i], is_on[i], shades[i], normals[i], views[i], poses, in_cam, direction, shade)
+        used = _to_cameras(
+            patches[i],
+            is_on[i],
+            shades[i],
+            normal=normals[i],
+            views=views[i],
+            poses=poses,
+            in_cam=in_cam,
+            direction=direction,
+            shade=shade,
+        )
         if used < _MIN_POINTS:
             continue
         for s in range(s_all):
@@ -78,10 +94,16 @@ def sweep_scores(
 
 @kernel(fastmath=_FAST, numpy_errors=True)
 def _to_cameras(
-    patch: NDArray[np.float64], is_on: NDArray[np.bool_], shades: NDArray[np.float64], normal: NDArray[np.float64],
-    views: NDArray[np.int64], poses: NDArray[np.float64], in_cam: NDArray[np.float64], direction: NDArray[np.float64],
-    shade: NDArray[np.float64]
-) -> int:  # fmt: skip
+    patch: NDArray[np.float64],
+    is_on: NDArray[np.bool_],
+    shades: NDArray[np.float64],
+    normal: NDArray[np.float64],
+    views: NDArray[np.int64],
+    poses: NDArray[np.float64],
+    in_cam: NDArray[np.float64],
+    direction: NDArray[np.float64],
+    shade: NDArray[np.float64],
+) -> int:
     """Points in use, packed, and the normal in the frames of the cameras; shades packed alike. Returns their number."""
     used = 0
     for p in range(len(is_on)):
@@ -92,9 +114,11 @@ def _to_cameras(
                     continue
                 for k in range(3):
                     in_cam[v, k, used] = (
-                        poses[m, k, 0] * patch[p, 0] + poses[m, k, 1] * patch[p, 1]
-                        + poses[m, k, 2] * patch[p, 2] + poses[m, k, 3]
-                    )  # fmt: skip
+                        poses[m, k, 0] * patch[p, 0]
+                        + poses[m, k, 1] * patch[p, 1]
+                        + poses[m, k, 2] * patch[p, 2]
+                        + poses[m, k, 3]
+                    )
             for k in range(3):
                 shade[k, used] = shades[p, k]
             used += 1
@@ -168,9 +192,12 @@ def _normalise(values: Any, shade: Any, used: Any, min_contrast: Any, total: Any
 
 @kernel(fastmath=_FAST, numpy_errors=True)
 def _compare(
-    values: NDArray[np.float64], total: NDArray[np.float64], used: int, contributing: int,
-    similarity: NDArray[np.float32]
-) -> float:  # fmt: skip
+    values: NDArray[np.float64],
+    total: NDArray[np.float64],
+    used: int,
+    contributing: int,
+    similarity: NDArray[np.float32],
+) -> float:
     """Mean correlation of all pairs of views, and into ``similarity`` that of each with the mean of the others."""
     square = 0.0
     for p in range(used):
@@ -190,7 +217,7 @@ def _compare(
 @kernel
 def choose_views(
     visible: NDArray[np.bool_], cosines: NDArray[np.float64], directions: NDArray[np.float64], max_views: int
-) -> NDArray[np.int64]:  # fmt: skip
+) -> NDArray[np.int64]:
     """Choose the views of each sample greedily: seen at a steep angle, and from directions 20° apart where possible.
 
     Args:
@@ -226,9 +253,12 @@ def choose_views(
 
 @kernel
 def vote_shifts(
-    scores: NDArray[np.float32], steps: NDArray[np.float64], normals: NDArray[np.float64],
-    shifts: NDArray[np.float64], floor: float
-) -> NDArray[np.float64]:  # fmt: skip
+    scores: NDArray[np.float32],
+    steps: NDArray[np.float64],
+    normals: NDArray[np.float64],
+    shifts: NDArray[np.float64],
+    floor: float,
+) -> NDArray[np.float64]:
     """Sum over samples of how far their score exceeds ``floor`` where each shift puts them along their normals.
 
     Args:

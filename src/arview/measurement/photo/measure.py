@@ -12,12 +12,20 @@ from arview.cad.samples import Samples, sample_surface
 from arview.core.parallel import pool
 from arview.measurement.photo.component import MeasuredComponent
 from arview.measurement.photo.edges import ComponentEdges
-from arview.measurement.photo.options import PhotoOptions
 from arview.measurement.photo.patches import near_others
-from arview.measurement.photo.sweep import ComponentSweep, sweep_offsets
+from arview.measurement.photo.sweep import MIN_VIEWS, SAMPLE_SPACING_PX, SAMPLES, ComponentSweep, sweep_offsets
 from arview.measurement.photo.views import PhotoViews, load_views
 from arview.measurement.types import Method, Move, NotMeasured
 from arview.reconstruction.types import SparseModel
+
+ABSENT_SUPPORT = 0.1
+"""Share of a component's edges found below which nothing of it is there."""
+CLEAR_SUPPORT = 0.5
+"""Share of other components' edges found for the photos to show what is there."""
+MIN_CLEAR = 3
+"""Components whose edges are found so well that one without any edges is missing."""
+GONE_SHARE = 0.6
+"""A component is missing when more than this share of what it would hide is visible."""
 
 MethodResults = dict[Method, Move | NotMeasured]
 """The outcome of each method for one component."""
@@ -27,7 +35,6 @@ def measure_components_in_photos(
     sparse: SparseModel | PhotoViews,
     part: Part | None,
     model: Model,
-    options: PhotoOptions | None = None,
     progress: Callable[[str, float], None] | None = None,
     names: Sequence[str] | None = None,
 ) -> dict[str, MethodResults]:
@@ -40,7 +47,6 @@ def measure_components_in_photos(
         sparse: placed photos in mm, in the frame of the model within about 0.3 mm and 0.05°; or their views.
         part: roles and declared symmetries; None inspects every component.
         model: the nominal CAD.
-        options: see `PhotoOptions`.
         progress: called with the name of a finished component and the share that is done.
         names: components to measure; default: those inspected.
 
@@ -48,7 +54,6 @@ def measure_components_in_photos(
         InputError: there are fewer than three photos, photos cannot be read, a component does not exist, or the poses
             are not in the frame of the model.
     """
-    options = options or PhotoOptions()
     views = sparse if isinstance(sparse, PhotoViews) else load_views(sparse, model)
     if names is None:
         known = {component.name for component in model.components}
@@ -56,18 +61,16 @@ def measure_components_in_photos(
         names = names or [name for name in part.inspected if name in known] if part is not None else names
     indices = [model.index(name) for name in names]
     results: dict[str, MethodResults] = {}
-    jobs = [(index, pool().submit(measure_component, views, index, part, options)) for index in indices]
+    jobs = [(index, pool().submit(measure_component, views, index, part)) for index in indices]
     for done, (index, job) in enumerate(jobs, 1):
         name = model.components[index].name
         results[name] = job.result()
         if progress is not None:
             progress(name, done / len(jobs))
-    return {name: _absent_if_no_edges(found, results, options) for name, found in results.items()}
+    return {name: _absent_if_no_edges(found, results) for name, found in results.items()}
 
 
-def _absent_if_no_edges(
-    found: MethodResults, results: Mapping[str, MethodResults], options: PhotoOptions
-) -> MethodResults:
+def _absent_if_no_edges(found: MethodResults, results: Mapping[str, MethodResults]) -> MethodResults:
     """The result of a component as missing, if none of its edges is seen while those of others are seen well.
 
     This finds what is missing from surfaces without texture. The photos must show where it should be, and neither
@@ -76,11 +79,11 @@ def _absent_if_no_edges(
     edges = found.get("edges")
     if not isinstance(edges, NotMeasured) or edges.is_missing or isinstance(found.get("sweep"), Move):
         return found
-    if edges.support is None or edges.support > options.absent_support:
+    if edges.support is None or edges.support > ABSENT_SUPPORT:
         return found
     others = [one.get("edges") for one in results.values() if one is not found]
-    clear = sum(isinstance(one, Move) and one.support > options.clear_support for one in others)
-    if clear < options.min_clear:
+    clear = sum(isinstance(one, Move) and one.support > CLEAR_SUPPORT for one in others)
+    if clear < MIN_CLEAR:
         return found
     reason = (
         "missing, or far from its place: none of its edges is seen where it should be"
@@ -89,9 +92,9 @@ def _absent_if_no_edges(
     return {method: NotMeasured(edges.component, method, reason, is_missing=True) for method in found}
 
 
-def measure_component(views: PhotoViews, index: int, part: Part | None, options: PhotoOptions) -> MethodResults:
+def measure_component(views: PhotoViews, index: int, part: Part | None) -> MethodResults:
     """Measure one component by both methods; if the edges fail, check whether the component is missing."""
-    body = MeasuredComponent(views, index, part, options)
+    body = MeasuredComponent(views, index, part)
     edges = ComponentEdges(body).measure()
     # The place found by edges is one more start of the sweep; the sweep's result there remains independent.
     sweep = ComponentSweep(body).measure([edges.measured_from_nominal] if isinstance(edges, Move) else [])
@@ -108,17 +111,14 @@ def measure_component(views: PhotoViews, index: int, part: Part | None, options:
 
 def is_gone(body: MeasuredComponent) -> bool:
     """Whether the photos show the surfaces of other components that this one would hide."""
-    o, model = body.options.sweep, body.views.model
-    samples = sample_surface(body.shape, o.sample_spacing_px * body.px_mm, o.samples)
+    model = body.views.model
+    samples = sample_surface(body.shape, SAMPLE_SPACING_PX * body.px_mm, SAMPLES)
     contact = samples.of(near_others(samples.points, model, body.index, 0.5))
     if len(contact.points) < 10:
         return False
     # The surface below faces opposite to the component's own.
     below = Samples(contact.points, -contact.normals)
-    found = sweep_offsets(below.points, below.normals, body.views, 3.0 * body.px_mm, o, removed=body.index)
-    visible = np.count_nonzero(found.views >= 0, axis=1) >= o.min_views
+    found = sweep_offsets(below.points, below.normals, body.views, 3.0 * body.px_mm, removed=body.index)
+    visible = np.count_nonzero(found.views >= 0, axis=1) >= MIN_VIEWS
     agree = visible & found.is_ok & (np.abs(found.offsets_mm) < 1.5 * body.px_mm)
-    return bool(
-        np.count_nonzero(visible) >= 10
-        and np.count_nonzero(agree) > body.options.gone_share * np.count_nonzero(visible)
-    )
+    return bool(np.count_nonzero(visible) >= 10 and np.count_nonzero(agree) > GONE_SHARE * np.count_nonzero(visible))

@@ -181,9 +181,13 @@ def _nearer_than(points: NDArray[np.float64], corners: NDArray[np.float64], reac
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
         for k in range(count):
             if (
-                x < boxes[k, 0] or y < boxes[k, 1] or z < boxes[k, 2]
-                or x > boxes[k, 3] or y > boxes[k, 4] or z > boxes[k, 5]
-            ):  # fmt: skip
+                x < boxes[k, 0]
+                or y < boxes[k, 1]
+                or z < boxes[k, 2]
+                or x > boxes[k, 3]
+                or y > boxes[k, 4]
+                or z > boxes[k, 5]
+            ):
                 continue
             n0, n1, n2 = planes[k, 0], planes[k, 1], planes[k, 2]
             is_inside, nearest = True, 1e300

@@ -8,9 +8,16 @@ import numpy as np
 
 from arview.errors import InputError
 from arview.geometry import Array
-from arview.measurement.photo.edges import EdgeOffsets, edge_offsets, pose_gain
+from arview.measurement.photo.edges import (
+    MIN_POINTS,
+    MIN_SIGMA_PX,
+    SPACING_PX,
+    SYSTEMATIC_PX,
+    EdgeOffsets,
+    edge_offsets,
+    pose_gain,
+)
 from arview.measurement.photo.fit import fit_rigid
-from arview.measurement.photo.options import EdgeOptions
 from arview.measurement.photo.patches import tangents_of
 from arview.measurement.photo.rival_edges import EdgePoints
 from arview.measurement.photo.views import PhotoViews
@@ -44,7 +51,6 @@ def fit_rim(
     diameter_mm: float,
     views: PhotoViews,
     reach_mm: float = 3.0,
-    options: EdgeOptions | None = None,
 ) -> RimFit:
     """Fit the translation of a circular edge within its plane, which is taken to be known.
 
@@ -55,17 +61,15 @@ def fit_rim(
         diameter_mm: of the edge.
         views: the photos.
         reach_mm: largest displacement that is found.
-        options: see `EdgeOptions`.
 
     Raises:
         InputError: the edge is not found in at least three photos.
     """
-    o = options or EdgeOptions()
     axis = np.asarray(axis, dtype=np.float64) / np.linalg.norm(axis)
     center = np.asarray(center_in_model, dtype=np.float64)
     first, second = (vectors[0] for vectors in tangents_of(axis[None]))
     px_mm = views.mm_per_px(center)
-    count = int(np.clip(np.pi * diameter_mm / (o.spacing_px * px_mm), 24, 180))
+    count = int(np.clip(np.pi * diameter_mm / (SPACING_PX * px_mm), 24, 180))
     angle = 2.0 * np.pi * (np.arange(count) + 0.5) / count
     radial = np.cos(angle)[:, None] * first + np.sin(angle)[:, None] * second
     around = np.cross(axis, radial)
@@ -77,20 +81,26 @@ def fit_rim(
         rim = center + shift + radius_mm * radial
         edges, outward = _seen(views, rim, radial, around, axis)
         # The opposite side of the rim must stay out of reach.
-        found = edge_offsets(edges, center + shift, views, min(reach_px, 0.8 * radius_mm / px_mm), o)
+        found = edge_offsets(edges, center + shift, views, min(reach_px, 0.8 * radius_mm / px_mm))
         ok = found.seen & (found.slopes != 0.0)
-        if np.count_nonzero(ok) < o.min_points or len(np.unique(edges.view[ok])) < 3:
+        if np.count_nonzero(ok) < MIN_POINTS or len(np.unique(edges.view[ok])) < 3:
             raise InputError(
                 f"rim of ⌀{diameter_mm:g} mm at ({', '.join(f'{x:.1f}' for x in center)}): its edge is found in "
                 f"{len(np.unique(edges.view[ok]))} photos at {np.count_nonzero(ok)} points; take photos that show it"
             )
         fit = fit_rigid(
-            _rows(found, outward)[ok], found.offsets_mm[ok], 0.3 * found.mm_per_px[ok], np.array(locked), 1.0,
-            reach_mm, edges.points[ok] / (4.0 * px_mm), o.min_sigma_px / 0.3,
-        )  # fmt: skip
+            _rows(found, outward)[ok],
+            found.offsets_mm[ok],
+            0.3 * found.mm_per_px[ok],
+            free=np.array(locked),
+            radius_mm=1.0,
+            undetermined_mm=reach_mm,
+            places=edges.points[ok] / (4.0 * px_mm),
+            min_sigma=MIN_SIGMA_PX / 0.3,
+        )
         shift = shift + fit.twist[3:]
         radius_mm += float(fit.twist[0])
-    systematic_mm = o.systematic_px * px_mm
+    systematic_mm = SYSTEMATIC_PX * px_mm
     covariance = fit.covariance[3:, 3:] + systematic_mm**2 * (np.eye(3) - np.outer(axis, axis))
     if views.pose_covariance is not None:
         by_poses = pose_gain(views, fit, edges.view[ok], found.pose_rows[ok])[3:]

@@ -59,15 +59,21 @@ def rival_offsets_px(edges: EdgePoints, views: PhotoViews, reach_px: float, same
             continue
         index = np.flatnonzero(good)
         first, second = index[pairs[:, 0]], index[pairs[:, 1]]
-        _note(result, of, first, second, pixels, along, reach_px, same_px)
-        _note(result, of, second, first, pixels, along, reach_px, same_px)
+        _note(result, of, first, second=second, pixels=pixels, along=along, reach_px=reach_px, same_px=same_px)
+        _note(result, of, second, second=first, pixels=pixels, along=along, reach_px=reach_px, same_px=same_px)
     return result
 
 
 def _note(
-    result: Array, of: NDArray[np.int64], first: NDArray[np.int64], second: NDArray[np.int64], pixels: Array,
-    along: Array, reach_px: float, same_px: float,
-) -> None:  # fmt: skip
+    result: Array,
+    of: NDArray[np.int64],
+    first: NDArray[np.int64],
+    second: NDArray[np.int64],
+    pixels: Array,
+    along: Array,
+    reach_px: float,
+    same_px: float,
+) -> None:
     """Take over the offsets of the first points of pairs where the second ones are on a nearer edge beside theirs."""
     apart = pixels[second] - pixels[first]
     normal = np.stack([-along[first, 1], along[first, 0]], axis=1)

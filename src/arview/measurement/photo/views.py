@@ -137,9 +137,16 @@ class PhotoViews:
         """
         stack = self.levels[0]
         return _all_visible(
-            groups, stack.poses[view], stack.lenses[view], stack.sizes[view], np.array(window.lens),
-            np.array(window.origin), window.inverse_depth, window.ids, component,
-        )  # fmt: skip
+            groups,
+            stack.poses[view],
+            stack.lenses[view],
+            size=stack.sizes[view],
+            ideal=np.array(window.lens),
+            origin=np.array(window.origin),
+            inverse_depth=window.inverse_depth,
+            ids=window.ids,
+            component=component,
+        )
 
 
 def load_views(sparse: SparseModel, model: Model) -> PhotoViews:
@@ -201,10 +208,16 @@ def apply_all(cam_from_model: Array, point: Array) -> Array:
 
 @kernel
 def _all_visible(
-    groups: NDArray[np.float64], pose: NDArray[np.float64], lens: NDArray[np.float64], size: NDArray[np.int64],
-    ideal: NDArray[np.float64], origin: NDArray[np.int64], inverse_depth: NDArray[np.float64], ids: NDArray[np.int32],
-    component: int
-) -> NDArray[np.bool_]:  # fmt: skip
+    groups: NDArray[np.float64],
+    pose: NDArray[np.float64],
+    lens: NDArray[np.float64],
+    size: NDArray[np.int64],
+    ideal: NDArray[np.float64],
+    origin: NDArray[np.int64],
+    inverse_depth: NDArray[np.float64],
+    ids: NDArray[np.int32],
+    component: int,
+) -> NDArray[np.bool_]:
     """(N,) whether all points of each group are inside the picture and not behind the rendered surface."""
     margin = 2.0
     height, width = inverse_depth.shape

@@ -23,20 +23,26 @@ _BOUND = float(np.sqrt(3.0))
 """Half the width of a rectangular distribution of unit variance."""
 
 
+FORM_MM = 0.005
+"""Standard uncertainty of a component's position by its own form; machined, not cast."""
+MIN_POSES_MM = 0.004
+"""Error of the poses that bundle adjustment does not see: lens model, tracks."""
+K = 2.0
+"""Coverage factor of a single direction; 2 is 95 % of a normal distribution."""
+PROBABILITY = 0.95
+"""Coverage of intervals."""
+
+
 @dataclass(frozen=True)
 class UncertaintyOptions:
     """Contributions that no covariance contains, and how the result is computed."""
 
-    form_mm: float = 0.005  # standard uncertainty of a component's position by its own form; machined, not cast
-    min_poses_mm: float = 0.004  # error of the poses that bundle adjustment does not see: lens model, tracks
-    k: float = 2.0  # coverage factor of a single direction; 2 is 95 % of a normal distribution
-    probability: float = 0.95  # coverage of intervals
     draws: int = 20_000  # JCGM 101 asks for 1e4 / (1 - p) for two digits; 20,000 give U with 0.7 % of noise
     seed: int = 0
     monte_carlo: bool = True
 
     def __post_init__(self) -> None:
-        if not 0.5 <= self.probability < 1 or self.draws < 100 or self.k <= 0:
+        if not 0.5 <= PROBABILITY < 1 or self.draws < 100 or K <= 0:
             raise InputError("uncertainty: expected probability from 0.5 to 1, at least 100 draws, k above 0")
 
 
@@ -118,9 +124,12 @@ class MeasuredPlacement:
 
 
 def place(
-    combined: CombinedMove, alignment: Alignment, poses: Array | None = None,
-    options: UncertaintyOptions | None = None, axes: Array | None = None,
-) -> MeasuredPlacement:  # fmt: skip
+    combined: CombinedMove,
+    alignment: Alignment,
+    poses: Array | None = None,
+    options: UncertaintyOptions | None = None,
+    axes: Array | None = None,
+) -> MeasuredPlacement:
     """Position of a component relative to the datum frame, with every contribution to its uncertainty.
 
     Args:
@@ -138,8 +147,8 @@ def place(
     project = project / unit[:, None] * unit
     own = [Contribution(f"noise of {method}", share) for method, share in combined.covariances.items()]
     own.append(Contribution("methods disagree", combined.disagreement))
-    own.append(Contribution("form", np.diag((options.form_mm / unit) ** 2), is_bounded=True))
-    minimum = np.diag((options.min_poses_mm / unit) ** 2)
+    own.append(Contribution("form", np.diag((FORM_MM / unit) ** 2), is_bounded=True))
+    minimum = np.diag((MIN_POSES_MM / unit) ** 2)
     own.append(Contribution("camera poses", minimum if poses is None else poses + minimum))
     frame = [Contribution(f"datum {one.label}", one.covariance) for one in alignment.datums]
     frame.append(Contribution("scale", alignment.scale_covariance))
@@ -166,11 +175,18 @@ def place(
         held = projector(axes, seen)
         some = None if deviations is None else deviations[:, part] @ held
         block = held @ covariance[part, part] @ held
-        lengths.append(length_of(held @ twist[part], block, some, int(seen.sum()), options))
+        lengths.append(length_of(held @ twist[part], block, some, int(seen.sum())))
     return MeasuredPlacement(
-        twist, covariance, contributions, combined.undetermined, observable_axes(combined.undetermined, np.eye(3)),
-        axes, own_observable, lengths[0], lengths[1],
-    )  # fmt: skip
+        twist,
+        covariance,
+        contributions,
+        undetermined=combined.undetermined,
+        observable=observable_axes(combined.undetermined, np.eye(3)),
+        axes=axes,
+        own_observable=own_observable,
+        distance=lengths[0],
+        angle=lengths[1],
+    )
 
 
 def observable_axes(undetermined: Array, axes: Array, tolerance: float = 0.05) -> NDArray[np.bool_]:
@@ -209,9 +225,7 @@ def rotate(rotation_vectors: Array, vectors: Array) -> Array:
     return along + np.cos(angle) * (vectors - along) + np.sin(angle) * np.cross(axis, vectors)
 
 
-def length_of(
-    vector: Array, covariance: Array, deviations: Array | None, axes: int, options: UncertaintyOptions
-) -> Length:
+def length_of(vector: Array, covariance: Array, deviations: Array | None, axes: int) -> Length:
     """Length of a measured vector, with its uncertainty.
 
     U is at least k standard uncertainties along the vector. A length that pure noise stays below with the given
@@ -223,7 +237,6 @@ def length_of(
         covariance: (3,3) of its error.
         deviations: (D,3) Monte Carlo draws of the error, or None.
         axes: number of determined axes.
-        options: coverage.
     """
     value = float(np.linalg.norm(vector))
     direction = _direction(vector, covariance)
@@ -231,18 +244,18 @@ def length_of(
     sigma = float(np.sqrt(max(0.0, np.trace(covariance)) / axes))
     corrected = rice_estimate(value, sigma, axes) if sigma > 0 else value
     if deviations is None:
-        by_noise = quantile_of_length(covariance, options.probability)
+        by_noise = quantile_of_length(covariance, PROBABILITY)
     else:
-        by_noise = float(np.quantile(np.linalg.norm(deviations, axis=1), options.probability))
-    uncertainty = options.k * along
+        by_noise = float(np.quantile(np.linalg.norm(deviations, axis=1), PROBABILITY))
+    uncertainty = K * along
     if value <= by_noise:
         uncertainty = max(uncertainty, value)
     elif deviations is None:
         uncertainty += value - corrected
     else:
         lengths = np.linalg.norm(corrected * direction + deviations, axis=1)
-        uncertainty = max(uncertainty, float(np.quantile(np.abs(lengths - corrected), options.probability)))
-    k = uncertainty / along if along > 0 else options.k
+        uncertainty = max(uncertainty, float(np.quantile(np.abs(lengths - corrected), PROBABILITY)))
+    k = uncertainty / along if along > 0 else K
     return Length(value, uncertainty, k, max(0.0, value - uncertainty), value + uncertainty, corrected)
 
 

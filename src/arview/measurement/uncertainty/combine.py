@@ -26,7 +26,7 @@ class Agreement:
         turn_deg: angle of the difference of their rotations, along directions that both determine.
         mixed_ratio: length of the difference of shift and turn together in all directions that both determine, in units
             of their joint covariance, divided by that which 95 % of such differences do not exceed.
-        is_contradiction: whether that length is beyond what chance explains, see `CombineOptions`.
+        is_contradiction: whether that length is beyond what chance explains.
     """
 
     first: Method
@@ -43,12 +43,10 @@ class Agreement:
         return self.difference_mm / self.joint_mm if self.joint_mm > 0 else 0.0
 
 
-@dataclass(frozen=True)
-class CombineOptions:
-    """When a direction is undetermined, and when two methods contradict each other."""
-
-    undetermined_mm: float = 0.3  # largest standard deviation of a determined direction; rotations at the radius
-    contradiction: float = 0.99  # share of differences that chance keeps below a contradiction
+UNDETERMINED_MM = 0.3
+"""Largest standard deviation of a determined direction; rotations at the radius."""
+CONTRADICTION = 0.99
+"""Share of differences that chance keeps below a contradiction."""
 
 
 @dataclass(frozen=True)
@@ -75,14 +73,17 @@ class CombinedMove:
         """The same move, stated for another point (3,) of the component."""
         names = tuple(self.covariances)
         twist, parts, undetermined = moved_to(
-            self.twist, [*self.covariances.values(), self.disagreement], self.undetermined, self.radius_mm,
+            self.twist,
+            [*self.covariances.values(), self.disagreement],
+            self.undetermined,
+            self.radius_mm,
             point_in_model - self.center_in_model,
-        )  # fmt: skip
+        )
         covariances = dict(zip(names, parts[:-1], strict=True))
         return CombinedMove(twist, covariances, parts[-1], undetermined, self.radius_mm, point_in_model)
 
 
-def combine(moves: Sequence[Move], options: CombineOptions | None = None) -> CombinedMove:
+def combine(moves: Sequence[Move]) -> CombinedMove:
     """Weighted mean of moves of one component by independent methods.
 
     Methods that differ by more than their covariances allow have an error that neither of them knows. For rotations and
@@ -93,14 +94,12 @@ def combine(moves: Sequence[Move], options: CombineOptions | None = None) -> Com
 
     Args:
         moves: at least one, all about the same centre.
-        options: see `CombineOptions`.
 
     Raises:
         InputError: there are no moves, or they are of different components.
     """
     if not moves or any(move.component != moves[0].component for move in moves):
         raise InputError("combine: expected at least one move, and all of one component")
-    options = options or CombineOptions()
     radius = moves[0].radius_mm
     unit = np.array([radius] * 3 + [1.0] * 3)
     scaled = np.outer(unit, unit)
@@ -112,7 +111,7 @@ def combine(moves: Sequence[Move], options: CombineOptions | None = None) -> Com
         inside = basis.T @ covariance @ basis
         weights.append(basis @ np.linalg.pinv(inside, rcond=1e-12, hermitian=True) @ basis.T)
     values, vectors = np.linalg.eigh(np.sum(weights, axis=0))
-    known = values > 1.0 / options.undetermined_mm**2
+    known = values > 1.0 / UNDETERMINED_MM**2
     inverse = (vectors[:, known] / values[known]) @ vectors[:, known].T
     gains = [inverse @ weight for weight in weights]
     twist = np.sum([gain @ one for gain, one in zip(gains, twists, strict=True)], axis=0)
@@ -125,13 +124,17 @@ def combine(moves: Sequence[Move], options: CombineOptions | None = None) -> Com
             )
         axes = _intersection(bases[i], bases[j])
         squares = _squared_difference(axes.T @ (twists[i] - twists[j]), axes.T @ (noise[i] + noise[j]) @ axes)
-        if squares > chi2_quantile(axes.shape[1], options.contradiction):
+        if squares > chi2_quantile(axes.shape[1], CONTRADICTION):
             disagreement += axes @ _between(axes.T @ twists[i], axes.T @ twists[j], axes.T @ twist) @ axes.T
     shares = [gain @ one @ gain.T / scaled for gain, one in zip(gains, noise, strict=True)]
     return CombinedMove(
-        twist / unit, {move.method: share for move, share in zip(moves, shares, strict=True)},
-        disagreement / scaled, vectors[:, ~known].T, radius, moves[0].center_in_model,
-    )  # fmt: skip
+        twist / unit,
+        {move.method: share for move, share in zip(moves, shares, strict=True)},
+        disagreement / scaled,
+        vectors[:, ~known].T,
+        radius,
+        moves[0].center_in_model,
+    )
 
 
 def _beyond_chance(
@@ -173,9 +176,8 @@ def chi2_quantile(freedom: int, probability: float) -> float:
     return float(2.0 * gammaincinv(0.5 * freedom, probability)) if freedom else float("inf")
 
 
-def agreements(moves: Sequence[Move], options: CombineOptions | None = None) -> tuple[Agreement, ...]:
+def agreements(moves: Sequence[Move]) -> tuple[Agreement, ...]:
     """Compare each pair of methods in the directions that both determine."""
-    options = options or CombineOptions()
     found = []
     for a, b in combinations(moves, 2):
         unit = np.array([a.radius_mm] * 3 + [1.0] * 3)
@@ -187,13 +189,15 @@ def agreements(moves: Sequence[Move], options: CombineOptions | None = None) -> 
             turn, shift = np.split(shared @ apart, 2)
             found.append(
                 Agreement(
-                    a.method, b.method, float(np.linalg.norm(shift)),
+                    a.method,
+                    b.method,
+                    float(np.linalg.norm(shift)),
                     quantile_of_length((shared @ joint @ shared.T)[3:, 3:]),
                     float(np.rad2deg(np.linalg.norm(turn) / a.radius_mm)),
                     float(np.sqrt(squares / chi2_quantile(freedom, 0.95))),
-                    squares > chi2_quantile(freedom, options.contradiction),
+                    squares > chi2_quantile(freedom, CONTRADICTION),
                 )
-            )  # fmt: skip
+            )
     return tuple(found)
 
 

@@ -87,9 +87,14 @@ class PosePropagation:
     """
 
     def __init__(
-        self, sparse: SparseModel, model: Model, alignment: Alignment, base: Sequence[str], points: int = 60,
+        self,
+        sparse: SparseModel,
+        model: Model,
+        alignment: Alignment,
+        base: Sequence[str],
+        points: int = 60,
         used: Callable[[str | None], NDArray[np.bool_]] | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Compute the derivative of scale and datum frame by the poses.
 
         Args:

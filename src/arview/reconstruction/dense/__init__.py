@@ -15,7 +15,7 @@ from arview.errors import InputError
 from arview.reconstruction.dense.depth import depth_maps
 from arview.reconstruction.dense.files import read_map, read_ply, write_map, write_maps, write_ply
 from arview.reconstruction.dense.fusion import fuse
-from arview.reconstruction.dense.options import DenseOptions
+from arview.reconstruction.dense.options import MIN_VIEWS, DenseOptions
 from arview.reconstruction.dense.views import Cad, DenseView, choose_sources, make_view
 from arview.reconstruction.types import DenseCloud, SparseModel
 
@@ -60,23 +60,23 @@ def reconstruct_dense(
     options = options or DenseOptions()
     progress = progress or (lambda name, done, total: None)
     threads = options.threads or max(1, min(8, os.cpu_count() or 1))
-    sources = choose_sources(sparse, options)
+    sources = choose_sources(sparse)
     with ThreadPoolExecutor(threads) as pool:
         made = pool.map(
             lambda i: make_view(sparse, i, sources[i], cad, options, lambda photo: read_photo(photo.path)),
             [i for i in range(len(sparse.photos)) if sources[i]],
         )
         views = _linked([view for view in made if view is not None])
-    if len(views) < options.min_views:
+    if len(views) < MIN_VIEWS:
         raise InputError(
             f"dense: only {len(views)} photos see enough of the same surface from useful angles, "
-            f"expected {options.min_views}; take more photos all around, 10 to 20 degrees apart"
+            f"expected {MIN_VIEWS}; take more photos all around, 10 to 20 degrees apart"
         )
     maps = depth_maps(views, sparse, cad, options, threads, progress)
     if folder is not None:
         for view, depth_map in zip(views, maps, strict=True):
             write_maps(folder, view.name, depth_map)
-    return fuse(maps, [view.color for view in views], options, threads, progress)
+    return fuse(maps, [view.color for view in views], threads, progress)
 
 
 def _linked(views: list[DenseView]) -> list[DenseView]:

@@ -18,13 +18,20 @@ from numpy.typing import NDArray
 from arview.camera import Camera
 from arview.core.progress import Progress
 from arview.reconstruction.dense.kernels import PARALLAX, Problem, make_scratch
-from arview.reconstruction.dense.options import DenseOptions
+from arview.reconstruction.dense.options import BEST_SOURCES, DenseOptions
 from arview.reconstruction.dense.patchmatch import NEIGHBOURS, sweep, try_hypotheses
 from arview.reconstruction.dense.polish import polish
 from arview.reconstruction.dense.torch_search import search_torch
 from arview.reconstruction.dense.views import Cad, DenseView, Floats, Planes, cad_planes, relative_pose, sparse_planes
 from arview.reconstruction.gpu.device import torch_device
 from arview.reconstruction.types import SparseModel
+
+CAD_HYPOTHESES = True
+"""Also start from the surface of the CAD. It is only a hypothesis: photo-consistency decides."""
+NOISE = 1.5
+"""Standard deviation of the photos' noise in grey levels; less contrast does not count as texture."""
+GEOMETRIC_WEIGHT = 0.1
+"""Cost of one pixel of disagreement with the depth map of a source."""
 
 STEPS = (4, 2)
 """Pixels of the working size per pixel of each PatchMatch stage; the depth maps have the grid of the last stage."""
@@ -73,9 +80,9 @@ def depth_maps(
     with ThreadPoolExecutor(threads) as pool:
         for stage, step in enumerate(STEPS):
             small = [_shrunk(grey, step) for grey in greys]
-            search = partial(_search, views, small, maps, sparse, cad, options, stage, device)
+            search = partial(_search, views, small, maps, sparse, cad, (options, device), stage)
             maps = _each(pool, search, len(views), f"depth maps {stage + 1} of {len(STEPS)}", progress)
-        return _each(pool, partial(_polished, views, greys, maps, options), len(views), "polishing", progress)
+        return _each(pool, partial(_polished, views, greys, maps), len(views), "polishing", progress)
 
 
 def _each(pool: ThreadPoolExecutor, job: Callable[[int], T], count: int, name: str, progress: Progress) -> list[T]:
@@ -106,9 +113,7 @@ def _grown(planes: Planes, factor: int) -> Planes:
     return fine
 
 
-def _problem(
-    views: list[DenseView], index: int, greys: list[Floats], maps: list[Planes], step: int, options: DenseOptions
-) -> Problem:
+def _problem(views: list[DenseView], index: int, greys: list[Floats], maps: list[Planes], step: int) -> Problem:
     """The arrays of one view and its sources at one resolution; ``maps`` are the sources' depth maps, or empty."""
     view = views[index]
     camera = view.camera.scaled(greys[index].shape[1], greys[index].shape[0])
@@ -128,7 +133,7 @@ def _problem(
     maps_there = [maps[k] for k in sources] if maps else []
     region = _shrunk(view.region.astype(np.float32), step) > 0.5
     map_step = camera.width / maps[index].shape[1] if maps else 1.0
-    numbers = [options.noise**2, options.geometric_weight, map_step, options.best_sources]
+    numbers = [NOISE**2, GEOMETRIC_WEIGHT, map_step, BEST_SOURCES]
     return Problem(
         grey=greys[index],
         region=region.astype(np.uint8),
@@ -154,17 +159,24 @@ def _layout(images: list[NDArray[np.float32]]) -> NDArray[np.int32]:
 
 
 def _search(
-    views: list[DenseView], greys: list[Floats], maps: list[Planes], sparse: SparseModel, cad: Cad | None,
-    options: DenseOptions, stage: int, device: str | None, index: int,
-) -> Planes:  # fmt: skip
-    """PatchMatch of one view at one level; ``maps`` are those of the previous level, or empty."""
+    views: list[DenseView],
+    greys: list[Floats],
+    maps: list[Planes],
+    sparse: SparseModel,
+    cad: Cad | None,
+    how: tuple[DenseOptions, str | None],
+    stage: int,
+    index: int,
+) -> Planes:
+    """PatchMatch of one view at one level by options and a torch device; ``maps``: of the previous level, or empty."""
+    options, device = how
     view, step = views[index], STEPS[stage]
     height, width = greys[index].shape
     camera = view.camera.scaled(width, height)
     given = [_grown(maps[index], STEPS[stage - 1] // step)] if maps else [sparse_planes(sparse, view.index, camera)]
-    if cad is not None and options.cad_hypotheses:
+    if cad is not None and CAD_HYPOTHESES:
         given.insert(0 if stage == 0 else 1, cad_planes(cad, view.cam_from_scan, camera))
-    problem = _problem(views, index, greys, maps, step, options)
+    problem = _problem(views, index, greys, maps, step)
     seed = (options.seed * 0x9E3779B1 + view.index * 0x85EBCA6B + stage * 0xC2B2AE35) & 0x7FFFFFFF
     low, high = 1.0 / view.farthest, 1.0 / view.nearest
     depth = 2.0 / (low + high)
@@ -173,32 +185,68 @@ def _search(
     steps = [(0.5 ** (turn + stage) * unit_w, 0.5 * 0.5 ** (turn + stage)) for turn in range(SWEEPS[stage])]
     randoms = RANDOMS if stage == 0 else 0
     if device is not None:
-        return search_torch(problem, np.stack(given), spread, randoms, low, high, steps, stage > 0, seed, device)
+        return search_torch(
+            problem,
+            np.stack(given),
+            spread,
+            randoms=randoms,
+            low=low,
+            high=high,
+            steps=steps,
+            is_dense=stage > 0,
+            seed=seed,
+            device=device,
+        )
     planes, costs = np.zeros((height, width, 3), np.float32), np.empty((height, width), np.float32)
     scratch, indices = make_scratch(is_dense=stage > 0)
     try_hypotheses(
-        problem, scratch, indices, planes, costs, np.stack(given), np.float32(spread), randoms,
-        np.float32(low), np.float32(high), seed,
-    )  # fmt: skip
+        problem,
+        scratch,
+        indices,
+        planes=planes,
+        costs=costs,
+        hypotheses=np.stack(given),
+        spread=np.float32(spread),
+        randoms=randoms,
+        lowest=np.float32(low),
+        highest=np.float32(high),
+        seed=seed,
+    )
     for turn, (step_w, step_tilt) in enumerate(steps):
         for color in (0, 1):
             sweep(
-                problem, scratch, indices, planes, costs, NEIGHBOURS, color,
-                np.float32(step_w), np.float32(step_tilt), seed + 101 * (turn + 1),
-            )  # fmt: skip
+                problem,
+                scratch,
+                indices,
+                planes=planes,
+                costs=costs,
+                regions=NEIGHBOURS,
+                color=color,
+                step_w=np.float32(step_w),
+                step_tilt=np.float32(step_tilt),
+                seed=seed + 101 * (turn + 1),
+            )
     return planes
 
 
-def _polished(
-    views: list[DenseView], greys: list[Floats], maps: list[Planes], options: DenseOptions, index: int
-) -> DepthMap:
+def _polished(views: list[DenseView], greys: list[Floats], maps: list[Planes], index: int) -> DepthMap:
     """Refine the depth map of one view at the working size."""
     planes = maps[index].copy()
     height, width = planes.shape[:2]
-    problem = _problem(views, index, greys, [], 1, options)
+    problem = _problem(views, index, greys, [], 1)
     unit_w = 1.0 / float(np.mean(problem.warps[:, PARALLAX]))
     scores, sigmas = np.empty((height, width), np.float32), np.empty((height, width), np.float32)
     scratch, indices = make_scratch(0.5 * (STEPS[-1] - 1))
-    polish(problem, scratch, indices, planes, scores, sigmas, STEPS[-1], POLISH_ITERATIONS, unit_w)
+    polish(
+        problem,
+        scratch,
+        indices,
+        planes=planes,
+        scores=scores,
+        sigmas=sigmas,
+        step_px=STEPS[-1],
+        iterations=POLISH_ITERATIONS,
+        unit_w=unit_w,
+    )
     camera = views[index].camera.scaled(width, height)
     return DepthMap(camera, views[index].cam_from_scan, planes, scores, sigmas, unit_w * STEPS[-1])

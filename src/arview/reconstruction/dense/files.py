@@ -114,6 +114,9 @@ def read_ply(path: str | Path) -> DenseCloud:
         return np.stack([rows[name] for name in names.split()], axis=-1)
 
     return DenseCloud(
-        columns("x y z"), columns("nx ny nz"), columns("red green blue"),  # type: ignore[arg-type]
-        rows["sigma_mm"].astype(np.float32), rows["views"].astype(np.uint8),
-    )  # fmt: skip
+        columns("x y z"),
+        columns("nx ny nz"),
+        columns("red green blue"),  # type: ignore[arg-type]
+        rows["sigma_mm"].astype(np.float32),
+        rows["views"].astype(np.uint8),
+    )

@@ -20,9 +20,23 @@ from arview.core.kernel import kernel
 from arview.core.progress import Progress
 from arview.geometry import Array, invert
 from arview.reconstruction.dense.depth import DepthMap
-from arview.reconstruction.dense.options import DenseOptions
+from arview.reconstruction.dense.options import MIN_VIEWS
 from arview.reconstruction.dense.views import Image
 from arview.reconstruction.types import DenseCloud
+
+MIN_ZNCC = 0.5
+"""Pixels with a lower mean correlation with the sources are not used."""
+MAX_SIGMA_PX = 0.25
+"""Pixels with a larger standard deviation, in pixels of parallax, are not used: no texture."""
+MAX_SPREAD_PX = 0.2
+"""Largest standard deviation of a merged point along its normal, in pixels of the maps at the point."""
+AGREEMENT_PX = 1.5
+"""Two depth maps agree if the point moves by less than this in the photo, in pixels of the maps (half the working size)
+…."""
+NORMAL_ANGLE_DEG = 20.0
+"""… and their normals differ by less than this."""
+GRAZING_DEG = 75.0
+"""Surfaces seen at a larger angle from their normal are not used."""
 
 MAX_NEIGHBOURS = 8
 """Other views against which a view is checked."""
@@ -61,36 +75,46 @@ class _Stack:
 
 
 def fuse(
-    maps: Sequence[DepthMap], images: Sequence[Image], options: DenseOptions, threads: int,
+    maps: Sequence[DepthMap],
+    images: Sequence[Image],
+    threads: int,
     progress: Progress,
-) -> DenseCloud:  # fmt: skip
+) -> DenseCloud:
     """Fuse depth maps into the cloud of all points that ``options.min_views`` maps agree on.
 
     Args:
         maps: depth maps of the views.
         images: (H,W,3) uint8 RGB of each map's size.
-        options: see `DenseOptions`.
         threads: number of views worked on at a time.
         progress: called with the stage's name, views done and views in all.
 
     Returns:
         The cloud; empty when no points agree.
     """
-    stack = _stacked(maps, options)
+    stack = _stacked(maps)
     limits = np.array(
         [
-            options.agreement_px,
+            AGREEMENT_PX,
             _RELATIVE_DEPTH,
-            np.cos(np.deg2rad(options.normal_angle_deg)),
-            options.min_views,
-            options.max_spread_px,
+            np.cos(np.deg2rad(NORMAL_ANGLE_DEG)),
+            MIN_VIEWS,
+            MAX_SPREAD_PX,
         ]
     )
     neighbours = [_neighbour_views(maps, i) for i in range(len(maps))]
     merged = np.zeros((len(stack.elements), 3), dtype=np.float32)
 
     def merge(i: int) -> None:
-        _merge(i, neighbours[i], stack.elements, stack.layout, stack.cameras, stack.poses, limits, merged)
+        _merge(
+            i,
+            neighbours[i],
+            stack.elements,
+            layout=stack.layout,
+            cameras=stack.cameras,
+            poses=stack.poses,
+            limits=limits,
+            merged=merged,
+        )
 
     def points_of(i: int) -> _Points:
         first, width, height = stack.layout[i]
@@ -138,7 +162,7 @@ def _best_of_cells(
     return best[is_best]
 
 
-def _stacked(maps: Sequence[DepthMap], options: DenseOptions) -> _Stack:
+def _stacked(maps: Sequence[DepthMap]) -> _Stack:
     """All maps as arrays for kernels."""
     elements = []
     for m in maps:
@@ -148,8 +172,8 @@ def _stacked(maps: Sequence[DepthMap], options: DenseOptions) -> _Stack:
         a, b, w = planes[..., 1] * camera.fx, planes[..., 2] * camera.fy, planes[..., 0]
         c = w - a * x - b * y
         cosine = w / np.maximum(np.sqrt((a * a + b * b + c * c) * (x * x + y * y + 1.0)), 1e-30)
-        is_known = (w > 0) & (m.scores > 0) & (m.sigmas <= options.max_sigma_px * m.unit_w)
-        is_good = is_known & (m.scores >= options.min_zncc) & (cosine >= np.cos(np.deg2rad(options.grazing_deg)))
+        is_known = (w > 0) & (m.scores > 0) & (m.sigmas <= MAX_SIGMA_PX * m.unit_w)
+        is_good = is_known & (m.scores >= MIN_ZNCC) & (cosine >= np.cos(np.deg2rad(GRAZING_DEG)))
         element = np.stack([a, b, c, m.sigmas**2, np.where(is_known, w, 0.0), is_good], axis=-1)
         elements.append(element.reshape(-1, 6).astype(np.float32))
     sizes = np.array([(m.camera.width, m.camera.height) for m in maps])
@@ -188,10 +212,15 @@ def _seen_at(j: Any, p0: Any, p1: Any, p2: Any, layout: Any, cameras: Any, poses
 
 @kernel(numpy_errors=True)
 def _merge(
-    i: int, neighbours: NDArray[np.int64], elements: NDArray[np.float32], layout: NDArray[np.int64],
-    cameras: NDArray[np.float64], poses: NDArray[np.float64], limits: NDArray[np.float64],
-    merged: NDArray[np.float32]
-) -> None:  # fmt: skip
+    i: int,
+    neighbours: NDArray[np.int64],
+    elements: NDArray[np.float32],
+    layout: NDArray[np.int64],
+    cameras: NDArray[np.float64],
+    poses: NDArray[np.float64],
+    limits: NDArray[np.float64],
+    merged: NDArray[np.float32],
+) -> None:
     """Write merged depth, its standard deviation and the number of views of each pixel of view i that enough confirm.
 
     ``limits``: agreement in px, relative depth, cosine of the normals' angle, number of views, spread in px.
@@ -237,9 +266,18 @@ def _merge(
                 against += shift > 0.0
                 continue
             here = _confirmed_depth(
-                elements, q, poses, i, j, (x, y, depth, shift), (ray0, ray1, ray2), (n0, n1, n2, length), centre,
-                (fx, fy, xn, yn, z), (agreement, relative, min_cosine),
-            )  # fmt: skip
+                elements,
+                q,
+                poses,
+                i,
+                j,
+                (x, y, depth, shift),
+                (ray0, ray1, ray2),
+                (n0, n1, n2, length),
+                centre,
+                (fx, fy, xn, yn, z),
+                (agreement, relative, min_cosine),
+            )
             if here > 0.0:
                 depths[views], weights[views] = here, 1.0 / max(elements[q, 3] * here**4, 1e-18 * z * z)
                 views += 1
@@ -254,9 +292,18 @@ def _merge(
 
 @kernel(numpy_errors=True, inline=True)
 def _confirmed_depth(
-    elements: Any, q: Any, poses: Any, i: Any, j: Any, seen: Any, ray: Any, normal: Any, centre: Any, pixel: Any,
-    limits: Any
-) -> Any:  # fmt: skip
+    elements: Any,
+    q: Any,
+    poses: Any,
+    i: Any,
+    j: Any,
+    seen: Any,
+    ray: Any,
+    normal: Any,
+    centre: Any,
+    pixel: Any,
+    limits: Any,
+) -> Any:
     """Depth along a pixel's ray at which the element of another view lies, or -1 where the two disagree.
 
     Args:

@@ -86,7 +86,7 @@ def make_scratch(shift: float = 0.0, is_dense: bool = False) -> tuple[NDArray[np
 @kernel(fastmath=True, numpy_errors=True)
 def take_window(
     grey: NDArray[np.float32], s: NDArray[np.float32], x: float | np.float32, y: float | np.float32
-) -> float | np.float32:  # fmt: skip
+) -> float | np.float32:
     """Write weights (sum 1) and weighted, centred grey levels of the view's window to the scratch; return its variance.
 
     Pixels unlike the centre have less weight (bilateral). (x, y) lies such that samples are pixels.
@@ -117,9 +117,14 @@ def take_window(
 
 @kernel(fastmath=True, numpy_errors=True)
 def warp(
-    m: NDArray[np.float32], k: int, x: float | np.float32, y: float | np.float32, w: float | np.float32,
-    du: float | np.float32, dv: float | np.float32
-) -> tuple[float | np.float32, ...]:  # fmt: skip
+    m: NDArray[np.float32],
+    k: int,
+    x: float | np.float32,
+    y: float | np.float32,
+    w: float | np.float32,
+    du: float | np.float32,
+    dv: float | np.float32,
+) -> tuple[float | np.float32, ...]:
     """The homography of the window into source k, as three linear forms of (dx, dy): value and two slopes each."""
     tx, ty, tz = m[k, 9], m[k, 10], m[k, 11]
     x0 = m[k, 0] * x + m[k, 1] * y + m[k, 2] + w * tx
@@ -149,9 +154,13 @@ def falls_inside(sizes: NDArray[np.int32], k: int, h: tuple[float | np.float32, 
 
 @kernel(fastmath=True, numpy_errors=True)
 def sample(
-    pixels: NDArray[np.float32], sizes: NDArray[np.int32], s: NDArray[np.float32], index: NDArray[np.int32], k: int,
-    h: tuple[float | np.float32, ...]
-) -> None:  # fmt: skip
+    pixels: NDArray[np.float32],
+    sizes: NDArray[np.int32],
+    s: NDArray[np.float32],
+    index: NDArray[np.int32],
+    k: int,
+    h: tuple[float | np.float32, ...],
+) -> None:
     """Write four neighbours (A to D) and fractions (FU, FV) of each sample of the window in source k to the scratch."""
     x0, xu, xv, y0, yu, yv, z0, zu, zv = h
     first, width = sizes[k, FIRST], sizes[k, WIDTH]
@@ -175,9 +184,15 @@ def sample(
 
 @kernel(fastmath=True, numpy_errors=True)
 def zncc(
-    pixels: NDArray[np.float32], sizes: NDArray[np.int32], s: NDArray[np.float32], index: NDArray[np.int32], k: int,
-    h: tuple[float | np.float32, ...], variance: float | np.float32, noise: float | np.float32
-) -> float | np.float32:  # fmt: skip
+    pixels: NDArray[np.float32],
+    sizes: NDArray[np.int32],
+    s: NDArray[np.float32],
+    index: NDArray[np.int32],
+    k: int,
+    h: tuple[float | np.float32, ...],
+    variance: float | np.float32,
+    noise: float | np.float32,
+) -> float | np.float32:
     """Correlation of the window with source k; noise adds to the contrast and so lowers it."""
     sample(pixels, sizes, s, index, k, h)
     first, second, both = _ZERO, _ZERO, _ZERO
@@ -195,9 +210,14 @@ def zncc(
 
 @kernel(fastmath=True, numpy_errors=True)
 def disagreement_px(
-    maps: NDArray[np.float32], sizes: NDArray[np.int32], warps: NDArray[np.float32], step: float | np.float32, k: int,
-    h: tuple[float | np.float32, ...], w: float | np.float32
-) -> float | np.float32:  # fmt: skip
+    maps: NDArray[np.float32],
+    sizes: NDArray[np.int32],
+    warps: NDArray[np.float32],
+    step: float | np.float32,
+    k: int,
+    h: tuple[float | np.float32, ...],
+    w: float | np.float32,
+) -> float | np.float32:
     """Distance of the element from the depth map of source k in px of parallax, at most 3."""
     u, v = (h[0] / h[6] + _HALF) / step, (h[3] / h[6] + _HALF) / step
     column, row = int(u), int(v)
@@ -212,9 +232,13 @@ def disagreement_px(
 
 @kernel(fastmath=True, numpy_errors=True)
 def is_facing(
-    numbers: NDArray[np.float32], x: float | np.float32, y: float | np.float32, w: float | np.float32,
-    du: float | np.float32, dv: float | np.float32
-) -> bool:  # fmt: skip
+    numbers: NDArray[np.float32],
+    x: float | np.float32,
+    y: float | np.float32,
+    w: float | np.float32,
+    du: float | np.float32,
+    dv: float | np.float32,
+) -> bool:
     """Whether the element is in front of the camera and seen at less than 81° from its normal."""
     if not w > _ZERO:
         return False
@@ -226,11 +250,21 @@ def is_facing(
 
 @kernel(fastmath=True, numpy_errors=True)
 def element_cost(
-    pixels: NDArray[np.float32], maps: NDArray[np.float32], sizes: NDArray[np.int32], warps: NDArray[np.float32],
-    numbers: NDArray[np.float32], s: NDArray[np.float32], index: NDArray[np.int32], x: float | np.float32,
-    y: float | np.float32, w: float | np.float32, du: float | np.float32, dv: float | np.float32,
-    variance: float | np.float32, limit: float | np.float32
-) -> float | np.float32:  # fmt: skip
+    pixels: NDArray[np.float32],
+    maps: NDArray[np.float32],
+    sizes: NDArray[np.int32],
+    warps: NDArray[np.float32],
+    numbers: NDArray[np.float32],
+    s: NDArray[np.float32],
+    index: NDArray[np.int32],
+    x: float | np.float32,
+    y: float | np.float32,
+    w: float | np.float32,
+    du: float | np.float32,
+    dv: float | np.float32,
+    variance: float | np.float32,
+    limit: float | np.float32,
+) -> float | np.float32:
     """Mean of the best sources' 1 - ZNCC plus disagreement with their depth maps: 0 (best) to 2.
 
     It returns 2 without the remaining sources as soon as the mean cannot fall below ``limit``.
@@ -243,7 +277,9 @@ def element_cost(
         h = warp(warps, k, x, y, w, du, dv)
         cost = _WORST
         if falls_inside(sizes, k, h):
-            cost = min(_ONE - zncc(pixels, sizes, s, index, k, h, variance, numbers[NOISE]), _WORST)
+            cost = min(
+                _ONE - zncc(pixels, sizes, s, index=index, k=k, h=h, variance=variance, noise=numbers[NOISE]), _WORST
+            )
             if maps.shape[0] > 0:
                 cost += numbers[GEOMETRIC] * disagreement_px(maps, sizes, warps, numbers[MAP_STEP], k, h, w)
         j = k

@@ -46,10 +46,18 @@ def draw(seed: int, x: int, y: int, turn: int) -> float | np.float32:
 
 @kernel(fastmath=True)
 def try_hypotheses(
-    p: Problem, s: NDArray[np.float32], index: NDArray[np.int32], planes: NDArray[np.float32],
-    costs: NDArray[np.float32], hypotheses: NDArray[np.float32], spread: float | np.float32, randoms: int,
-    lowest: float | np.float32, highest: float | np.float32, seed: int
-) -> None:  # fmt: skip
+    p: Problem,
+    s: NDArray[np.float32],
+    index: NDArray[np.int32],
+    planes: NDArray[np.float32],
+    costs: NDArray[np.float32],
+    hypotheses: NDArray[np.float32],
+    spread: float | np.float32,
+    randoms: int,
+    lowest: float | np.float32,
+    highest: float | np.float32,
+    seed: int,
+) -> None:
     """Set each pixel to the best of given hypotheses (C,H,W,3) and of random ones.
 
     Random hypotheses are drawn within ``spread`` (in w) of the first given one, and between ``lowest`` and ``highest``.
@@ -83,8 +91,21 @@ def try_hypotheses(
                         du = w / fx * draw(seed, x, y, turn + 1)
                         dv = w / fy * draw(seed, x, y, turn + 2)
                 cost = element_cost(
-                    pixels, maps, sizes, warps, numbers, s, index, at_x, at_y, w, du, dv, variance, costs[y, x]
-                )  # fmt: skip
+                    pixels,
+                    maps,
+                    sizes,
+                    warps,
+                    numbers,
+                    s,
+                    index,
+                    x=at_x,
+                    y=at_y,
+                    w=w,
+                    du=du,
+                    dv=dv,
+                    variance=variance,
+                    limit=costs[y, x],
+                )
                 if cost < costs[y, x]:
                     costs[y, x] = cost
                     planes[y, x, 0], planes[y, x, 1], planes[y, x, 2] = w, du, dv
@@ -92,14 +113,18 @@ def try_hypotheses(
 
 @kernel(fastmath=True)
 def sweep(
-    p: Problem, s: NDArray[np.float32], index: NDArray[np.int32], planes: NDArray[np.float32],
-    costs: NDArray[np.float32], regions: NDArray[np.int64], color: int, step_w: float | np.float32,
-    step_tilt: float | np.float32, seed: int
-) -> None:  # fmt: skip
-    """Half a checkerboard iteration: planes of the best neighbours, then a perturbation.
-
-    ``step_w`` is the perturbation of w, ``step_tilt`` that of the slope (tangent).
-    """
+    p: Problem,
+    s: NDArray[np.float32],
+    index: NDArray[np.int32],
+    planes: NDArray[np.float32],
+    costs: NDArray[np.float32],
+    regions: NDArray[np.int64],
+    color: int,
+    step_w: float | np.float32,
+    step_tilt: float | np.float32,
+    seed: int,
+) -> None:
+    """Half a checkerboard iteration: planes of the best neighbours, then a perturbation of w and slope (tangent)."""
     grey, region, pixels, maps, sizes, warps, numbers = p
     height, width = costs.shape
     fx, fy = numbers[FX], numbers[FY]
@@ -110,8 +135,7 @@ def sweep(
                 continue
             at_x, at_y = float32(x), float32(y)
             variance = take_window(grey, s, at_x, at_y)
-            w, du, dv = planes[y, x, 0], planes[y, x, 1], planes[y, x, 2]
-            cost = costs[y, x]
+            w, du, dv, cost = planes[y, x, 0], planes[y, x, 1], planes[y, x, 2], costs[y, x]
             for r in range(regions.shape[0]):
                 lowest, bx, by = float32(2.0), -1, -1
                 for n in range(regions.shape[1]):
@@ -126,7 +150,20 @@ def sweep(
                 if abs(new_w - w) < same_w and tilt < float32(0.1) * step_tilt * w:
                     continue
                 new = element_cost(
-                    pixels, maps, sizes, warps, numbers, s, index, at_x, at_y, new_w, new_u, new_v, variance, cost
+                    pixels,
+                    maps,
+                    sizes,
+                    warps,
+                    numbers,
+                    s,
+                    index,
+                    x=at_x,
+                    y=at_y,
+                    w=new_w,
+                    du=new_u,
+                    dv=new_v,
+                    variance=variance,
+                    limit=cost,
                 )
                 if new < cost:
                     cost, w, du, dv = new, new_w, new_u, new_v
@@ -135,7 +172,20 @@ def sweep(
                 new_u = du + w / fx * step_tilt * draw(seed, x, y, 1)
                 new_v = dv + w / fy * step_tilt * draw(seed, x, y, 2)
                 new = element_cost(
-                    pixels, maps, sizes, warps, numbers, s, index, at_x, at_y, new_w, new_u, new_v, variance, cost
+                    pixels,
+                    maps,
+                    sizes,
+                    warps,
+                    numbers,
+                    s,
+                    index,
+                    x=at_x,
+                    y=at_y,
+                    w=new_w,
+                    du=new_u,
+                    dv=new_v,
+                    variance=variance,
+                    limit=cost,
                 )
                 if new < cost:
                     cost, w, du, dv = new, new_w, new_u, new_v

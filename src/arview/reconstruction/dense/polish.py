@@ -143,9 +143,16 @@ def _solve(q: NDArray[np.float64]) -> tuple[float, ...]:
 
 @kernel(numpy_errors=True)
 def polish(
-    p: Problem, s: NDArray[np.float32], index: NDArray[np.int32], planes: NDArray[np.float32],
-    scores: NDArray[np.float32], sigmas: NDArray[np.float32], step_px: int, iterations: int, unit_w: float
-) -> None:  # fmt: skip
+    p: Problem,
+    s: NDArray[np.float32],
+    index: NDArray[np.int32],
+    planes: NDArray[np.float32],
+    scores: NDArray[np.float32],
+    sigmas: NDArray[np.float32],
+    step_px: int,
+    iterations: int,
+    unit_w: float,
+) -> None:
     """Refine the planes (H,W,3) in place; write mean correlation (H,W) and standard deviation of w (H,W).
 
     The problem is ``step_px`` (1 or 2) times as fine as the planes, and ``unit_w`` is the change of w that moves a
@@ -177,7 +184,18 @@ def polish(
                 for k in range(count):
                     h = warp(warps, k, at_x, at_y, w, du, dv)
                     if falls_inside(sizes, k, h):
-                        _normal_equations(pixels, sizes, warps, s, index, k, h, variance, floor, system)
+                        _normal_equations(
+                            pixels,
+                            sizes,
+                            warps,
+                            s=s,
+                            index=index,
+                            k=k,
+                            h=h,
+                            variance=variance,
+                            noise=floor,
+                            system=system,
+                        )
                 if system[10] < needed:
                     lasting = False
                     break

@@ -40,9 +40,17 @@ _CHUNK = 1 << 17
 
 
 def search_torch(
-    problem: Problem, given: Planes, spread: float, randoms: int, low: float, high: float,
-    steps: list[tuple[float, float]], is_dense: bool, seed: int, device: str,
-) -> Planes:  # fmt: skip
+    problem: Problem,
+    given: Planes,
+    spread: float,
+    randoms: int,
+    low: float,
+    high: float,
+    steps: list[tuple[float, float]],
+    is_dense: bool,
+    seed: int,
+    device: str,
+) -> Planes:
     """PatchMatch of one view at one level.
 
     Args:
@@ -137,9 +145,13 @@ class _Search:
         m = self.warps[k]
         w, du, dv = plane.unbind(dim=1)
         forms = [  # of (dx, dy): value and slopes, see kernels.warp
-            (m[r] * x + m[r + 1] * y + m[r + 2] + w * m[9 + r // 3], m[r] + du * m[9 + r // 3],
-             m[r + 1] + dv * m[9 + r // 3]) for r in (0, 3, 6)
-        ]  # fmt: skip
+            (
+                m[r] * x + m[r + 1] * y + m[r + 2] + w * m[9 + r // 3],
+                m[r] + du * m[9 + r // 3],
+                m[r + 1] + dv * m[9 + r // 3],
+            )
+            for r in (0, 3, 6)
+        ]
         inside = torch.ones_like(w, dtype=torch.bool)
         for corner in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
             p, q, z = (f[0] + (RADIUS + 1) * (corner[0] * f[1] + corner[1] * f[2]) for f in forms)

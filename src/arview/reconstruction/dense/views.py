@@ -17,10 +17,16 @@ from arview.cad.model import Model
 from arview.camera import Camera
 from arview.errors import InputError
 from arview.geometry import Array, apply, invert
-from arview.reconstruction.dense.options import DenseOptions
+from arview.reconstruction.dense.options import SOURCES, DenseOptions
 from arview.reconstruction.intake.masks import mask_of
 from arview.reconstruction.types import PosedPhoto, SparseModel
 from arview.rendering.rasterizer import rasterise
+
+GOOD_ANGLE_DEG = (8.0, 25.0)
+"""Angles between two views of a point that count fully. Smaller angles do not determine depth, and at larger ones the
+surface looks different."""
+MAX_ANGLE_DEG = 50.0
+"""Views at a larger angle are no sources."""
 
 Image = NDArray[np.uint8]
 Floats = NDArray[np.float32]
@@ -67,7 +73,7 @@ class DenseView:
     sources: tuple[int, ...]
 
 
-def choose_sources(sparse: SparseModel, options: DenseOptions) -> list[tuple[int, ...]]:
+def choose_sources(sparse: SparseModel) -> list[tuple[int, ...]]:
     """For each photo the photos to compare with, best first: many common points, seen from useful angles.
 
     Every choice lowers the score of photos close to it, so that the sources lie all around (after Schönberger 2016 and
@@ -77,7 +83,7 @@ def choose_sources(sparse: SparseModel, options: DenseOptions) -> list[tuple[int
     seen = np.zeros((count, len(sparse.points_in_scan)), dtype=bool)
     seen[sparse.observed_photo, sparse.observed_point] = True
     centres = np.stack([photo.centre_in_scan for photo in sparse.photos])
-    low, high = options.good_angle_deg
+    low, high = GOOD_ANGLE_DEG
     score = np.zeros((count, count))
     apart = np.zeros((count, count))
     for i in range(count):
@@ -89,14 +95,14 @@ def choose_sources(sparse: SparseModel, options: DenseOptions) -> list[tuple[int
             cosine = np.sum(a * b, axis=1) / (np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1))
             angle = np.rad2deg(np.arccos(np.clip(cosine, -1.0, 1.0)))
             weights = np.clip(angle / low, 0.0, 1.0) ** 2
-            weights *= np.clip((options.max_angle_deg - angle) / (options.max_angle_deg - high), 0.0, 1.0)
+            weights *= np.clip((MAX_ANGLE_DEG - angle) / (MAX_ANGLE_DEG - high), 0.0, 1.0)
             score[i, j] = score[j, i] = weights.sum()
             apart[i, j] = apart[j, i] = np.median(angle)
     chosen: list[tuple[int, ...]] = []
     for i in range(count):
         left = score[i].copy()
         order: list[int] = []
-        while len(order) < options.sources and left.max() > 0.02 * score[i].max() > 0:
+        while len(order) < SOURCES and left.max() > 0.02 * score[i].max() > 0:
             best = int(np.argmax(left))
             order.append(best)
             left *= np.clip(np.where(apart[best] > 0, apart[best], 90.0) / low, 0.0, 1.0)
@@ -149,7 +155,15 @@ def make_view(
         grey = np.repeat(np.where(allowed, 255, 0).astype(np.uint8)[..., None], 3, axis=2)
         is_seen &= _undistorted(grey, photo.camera, camera)[0][..., 0] > 127
     return DenseView(
-        index, photo.name, camera, photo.cam_from_scan, color, inside & is_seen, nearest, farthest, sources
+        index,
+        photo.name,
+        camera,
+        cam_from_scan=photo.cam_from_scan,
+        color=color,
+        region=inside & is_seen,
+        nearest=nearest,
+        farthest=farthest,
+        sources=sources,
     )
 
 
@@ -216,9 +230,15 @@ def render_cad(cad: Cad, cam_from_scan: Array, camera: Camera) -> tuple[Array, N
     """Inverse depth (H,W), 0 off the part, and face ids (H,W) of the CAD in an ideal camera."""
     vertices, faces, _ = cad.model.mesh
     return rasterise(
-        apply(cam_from_scan @ cad.scan_from_model, vertices), faces,
-        camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height,
-    )  # fmt: skip
+        apply(cam_from_scan @ cad.scan_from_model, vertices),
+        faces,
+        camera.fx,
+        fy=camera.fy,
+        cx=camera.cx,
+        cy=camera.cy,
+        width=camera.width,
+        height=camera.height,
+    )
 
 
 def cad_planes(cad: Cad, cam_from_scan: Array, camera: Camera) -> Planes:

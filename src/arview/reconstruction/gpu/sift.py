@@ -290,7 +290,16 @@ def _oriented(layers: Any, found: _Found, number: int) -> _Part:
     left, top, right = before[which, peak], smooth[which, peak], after[which, peak]
     angle = (peak + 0.5 * (left - right) / (left - 2 * top + right)) % ANGLES * (2 * np.pi / ANGLES)
     x, y = (found.column + found.offset[:, 0])[which], (found.row + found.offset[:, 1])[which]
-    return _Part(gradients, number, found.layer[which], x, y, scale[which], angle.float(), found.contrast[which])
+    return _Part(
+        gradients,
+        number,
+        found.layer[which],
+        x=x,
+        y=y,
+        scale=scale[which],
+        angle=angle.float(),
+        strength=found.contrast[which],
+    )
 
 
 def _batches(gradients: list[tuple[Any, Any]], layer: Any, radii: Any) -> Any:

@@ -22,23 +22,10 @@ _COMPARED_PX = 400  # longest side of the pictures on which duplicates are confi
 _COMPARED_TILES = (6, 8)  # rows and columns of the tiles in which these are compared
 
 
-@dataclass(frozen=True)
-class CheckOptions:
-    """Thresholds for bad photos. Pixels are those of a picture whose longest side is 1000 to 2000 px."""
-
-    blurred_px: float = 2.0  # edge spread (Gaussian sigma) of a blurred photo; sharp ones have 0.3 to 1.2
-    blurred_ratio: float = 1.8  # the same relative to the median photo, to find one shaken photo among sharp ones
-    blurred_min_px: float = 1.3  # a photo below this is sharp enough, even if it is worse than the others
-    useless_px: float = 3.5  # edge spread at which features can no longer be placed …
-    useless_ratio: float = 3.0  # … and, relative to the median photo, at which the photo is not missed
-    min_textured: float = 0.02  # share of tiles with edges; the outline of a plain part gives 0.1
-    clipped: float = 0.4  # share of white pixels of an overexposed photo; a white background gives 0.3
-    clipped_more: float = 0.2  # the same above the median photo's share
-    dark_level: float = 50.0  # grey level that 95 % of a dark photo's pixels do not exceed
-    min_side_px: int = 320  # shorter side; smaller pictures are thumbnails and icons
-    max_aspect: float = 2.6  # longer over shorter side; more is a panorama, which no pinhole camera took
-    same_thumbs: float = 0.95  # correlation above which two pictures are compared in detail
-    same_shift: float = 0.00125  # of the longer side; pictures that differ by less than this shift show the same view
+SAME_THUMBS = 0.95
+"""Correlation above which two pictures are compared in detail."""
+SAME_SHIFT = 0.00125
+"""Of the longer side; pictures that differ by less than this shift show the same view."""
 
 
 @dataclass(frozen=True)
@@ -143,7 +130,7 @@ def thumbnail(gray: Pixels) -> Pixels:
     return np.asarray(cv2.resize(gray, size, interpolation=cv2.INTER_AREA))
 
 
-def same_views(thumbnails: list[Pixels], options: CheckOptions) -> list[tuple[int, int]]:
+def same_views(thumbnails: list[Pixels]) -> list[tuple[int, int]]:
     """Pairs (i < j) of pictures taken from the same place in the same direction, whatever their size and exposure.
 
     Candidates are found by correlation of tiny pictures. In every tile of a candidate pair the difference, after
@@ -154,11 +141,11 @@ def same_views(thumbnails: list[Pixels], options: CheckOptions) -> list[tuple[in
     tiny = np.stack([cv2.resize(t, _THUMB, interpolation=cv2.INTER_AREA).ravel() for t in thumbnails]).astype(float)
     tiny -= tiny.mean(axis=1, keepdims=True)
     tiny /= np.maximum(np.linalg.norm(tiny, axis=1, keepdims=True), 1e-9)
-    candidates = np.argwhere(np.triu(tiny @ tiny.T > options.same_thumbs, 1))
-    return [(int(i), int(j)) for i, j in candidates if _is_same_view(thumbnails[i], thumbnails[j], options)]
+    candidates = np.argwhere(np.triu(tiny @ tiny.T > SAME_THUMBS, 1))
+    return [(int(i), int(j)) for i, j in candidates if _is_same_view(thumbnails[i], thumbnails[j])]
 
 
-def _is_same_view(first: Pixels, second: Pixels, options: CheckOptions) -> bool:
+def _is_same_view(first: Pixels, second: Pixels) -> bool:
     """Whether two pictures show the same view."""
     if np.abs(np.subtract(first.shape, second.shape)).max() > 2:  # a rotated or cropped picture; 2 px are rounding
         return False
@@ -166,7 +153,7 @@ def _is_same_view(first: Pixels, second: Pixels, options: CheckOptions) -> bool:
     a = cv2.GaussianBlur(first.astype(np.float32), (0, 0), 1.0)
     b = cv2.GaussianBlur(cv2.resize(second, size).astype(np.float32), (0, 0), 1.0)
     gain, offset = np.polyfit(b.ravel(), a.ravel(), 1) if b.std() > 0 else (1.0, 0.0)
-    shift_px = options.same_shift * max(size)
+    shift_px = SAME_SHIFT * max(size)
     moved = shift_px * np.hypot(np.gradient(a, axis=0), np.gradient(a, axis=1))
 
     def tile_rms(values: NDArray[np.float32]) -> NDArray[np.float32]:

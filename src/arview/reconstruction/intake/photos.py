@@ -13,11 +13,34 @@ import numpy as np
 from arview.camera.exif import PhotoExif
 from arview.core.progress import StepProgress
 from arview.errors import ArviewError, InputError, MismatchError
-from arview.reconstruction.intake.checks import CheckOptions, PhotoCheck, check_photo, same_views, thumbnail
+from arview.reconstruction.intake.checks import PhotoCheck, check_photo, same_views, thumbnail
 from arview.reconstruction.intake.kept import kept
 from arview.reconstruction.intake.lenses import Lens, lenses_of
 from arview.reconstruction.intake.reading import RAW_SUFFIXES, Pixels, glance, photo_paths
 from arview.reconstruction.types import Photo
+
+BLURRED_PX = 2.0
+"""Edge spread (Gaussian sigma) of a blurred photo; sharp ones have 0.3 to 1.2."""
+BLURRED_RATIO = 1.8
+"""The same relative to the median photo, to find one shaken photo among sharp ones."""
+BLURRED_MIN_PX = 1.3
+"""A photo below this is sharp enough, even if it is worse than the others."""
+USELESS_PX = 3.5
+"""Edge spread at which features can no longer be placed …."""
+USELESS_RATIO = 3.0
+"""… and, relative to the median photo, at which the photo is not missed."""
+MIN_TEXTURED = 0.02
+"""Share of tiles with edges; the outline of a plain part gives 0.1."""
+CLIPPED = 0.4
+"""Share of white pixels of an overexposed photo; a white background gives 0.3."""
+CLIPPED_MORE = 0.2
+"""The same above the median photo's share."""
+DARK_LEVEL = 50.0
+"""Grey level that 95 % of a dark photo's pixels do not exceed."""
+MIN_SIDE_PX = 320
+"""Shorter side; smaller pictures are thumbnails and icons."""
+MAX_ASPECT = 2.6
+"""Longer over shorter side; more is a panorama, which no pinhole camera took."""
 
 MIN_PHOTOS = 3  # the third photo is the first that can contradict the others
 GOOD_NUMBER = "20 to 40 photos from all around the part, each sharing more than half of what it shows with the next"
@@ -66,7 +89,6 @@ class ReadPhoto:
 def intake_photos(
     source: str | Path | Sequence[str | Path],
     camera: str | Path | None = None,
-    options: CheckOptions | None = None,
     progress: StepProgress | None = None,
 ) -> Intake:
     """Read and check the photos of a folder.
@@ -78,7 +100,6 @@ def intake_photos(
     Args:
         source: folder, glob, or list of photo files; other files in a folder are ignored.
         camera: camera file, ``fov:DEG`` or, as None, ``exif``; see `lenses_of`.
-        options: thresholds of the checks.
         progress: called with the number of photos done and in all.
 
     Raises:
@@ -98,26 +119,24 @@ def intake_photos(
             if progress:
                 progress(done, len(paths))
     label = str(source) if isinstance(source, str | Path) else f"{len(paths)} files"
-    return assess(label, seen, rejected, camera, options or CheckOptions())
+    return assess(label, seen, rejected, camera)
 
 
-def assess(
-    label: str, seen: Sequence[ReadPhoto], rejected: dict[str, str], camera: str | Path | None, options: CheckOptions
-) -> Intake:
+def assess(label: str, seen: Sequence[ReadPhoto], rejected: dict[str, str], camera: str | Path | None) -> Intake:
     """Intake of photos that have been read; ``rejected`` holds reasons found so far. Raises as `intake_photos` does."""
     rejected = dict(rejected)
     total = len(seen) + len(rejected)
     for photo in seen:
-        reason = _unusable(photo, options)
+        reason = _unusable(photo)
         if reason:
             rejected[photo.name] = reason
-    _check_texture(label, seen, options)
+    _check_texture(label, seen)
     usable = [photo for photo in seen if photo.name not in rejected]
-    rejected |= _duplicates(usable, options)
+    rejected |= _duplicates(usable)
     usable = [photo for photo in usable if photo.name not in rejected]
-    rejected |= _too_blurred(usable, options)
+    rejected |= _too_blurred(usable)
     usable = [photo for photo in usable if photo.name not in rejected]
-    warnings = _exposure_warnings(usable, options) + _blur_warnings(usable, options)
+    warnings = _exposure_warnings(usable) + _blur_warnings(usable)
 
     lenses, lens_warnings = lenses_of([photo.exif for photo in usable], camera)
     warnings += lens_warnings
@@ -162,26 +181,26 @@ def _read_and_check(path: Path, name: str) -> ReadPhoto | str:
     return ReadPhoto(name, path, seen.exif, check_photo(name, seen.gray), thumbnail(seen.gray))
 
 
-def _unusable(photo: ReadPhoto, options: CheckOptions) -> str:
+def _unusable(photo: ReadPhoto) -> str:
     """Why a photo is unusable whatever the others are like; empty if it is usable."""
     width, height = photo.exif.upright_size
     check = photo.check
-    if min(width, height) < options.min_side_px:
+    if min(width, height) < MIN_SIDE_PX:
         return f"has only {width}×{height} px; give the photo itself, not a thumbnail"
-    if max(width, height) > options.max_aspect * min(width, height):
+    if max(width, height) > MAX_ASPECT * min(width, height):
         return f"is a panorama ({width}×{height} px), which a single camera position cannot show; give plain photos"
-    if check.textured >= options.min_textured:
+    if check.textured >= MIN_TEXTURED:
         return ""
-    if check.level_95 < options.dark_level:
+    if check.level_95 < DARK_LEVEL:
         return "is black or nearly black; take it again with more light"
-    if check.clipped > options.clipped:
+    if check.clipped > CLIPPED:
         return "is overexposed to white; take it again with less light"
     return "shows no texture: a plain surface, or wholly out of focus"
 
 
-def _check_texture(label: str, seen: Sequence[ReadPhoto], options: CheckOptions) -> None:
+def _check_texture(label: str, seen: Sequence[ReadPhoto]) -> None:
     """Raise InputError when more than half of the photos have no texture."""
-    plain = [photo.name for photo in seen if photo.check.textured < options.min_textured]
+    plain = [photo.name for photo in seen if photo.check.textured < MIN_TEXTURED]
     if plain and 2 * len(plain) > len(seen):
         raise InputError(
             f"{label}: {len(plain)} of {len(seen)} photos show no texture at all ({_listed(plain)}), so there is "
@@ -189,7 +208,7 @@ def _check_texture(label: str, seen: Sequence[ReadPhoto], options: CheckOptions)
         )
 
 
-def _duplicates(photos: Sequence[ReadPhoto], options: CheckOptions) -> dict[str, str]:
+def _duplicates(photos: Sequence[ReadPhoto]) -> dict[str, str]:
     """Of photos of the same view, all but the largest and sharpest, each with the reason."""
 
     def rank(index: int) -> tuple[int, float, int]:
@@ -198,26 +217,26 @@ def _duplicates(photos: Sequence[ReadPhoto], options: CheckOptions) -> dict[str,
         return -size, check.blur_px if np.isfinite(check.blur_px) else np.inf, index
 
     dropped: dict[str, str] = {}
-    for pair in same_views([photo.thumbnail for photo in photos], options):
+    for pair in same_views([photo.thumbnail for photo in photos]):
         best, other = (photos[index].name for index in sorted(pair, key=rank))
         if best not in dropped and other not in dropped:
             dropped[other] = f"shows the same view as {best}; it adds nothing"
     return dropped
 
 
-def _too_blurred(photos: Sequence[ReadPhoto], options: CheckOptions) -> dict[str, str]:
+def _too_blurred(photos: Sequence[ReadPhoto]) -> dict[str, str]:
     """Photos that are too blurred to be used, with the reason."""
-    limit = max(options.useless_px, options.useless_ratio * _usual_blur(photos))
+    limit = max(USELESS_PX, USELESS_RATIO * _usual_blur(photos))
     reason = "is too blurred to be used (shaken or out of focus); take it again"
     return {photo.name: reason for photo in photos if photo.check.blur_px > limit}
 
 
-def _blur_warnings(photos: Sequence[ReadPhoto], options: CheckOptions) -> list[str]:
+def _blur_warnings(photos: Sequence[ReadPhoto]) -> list[str]:
     """Warning about blurred photos."""
-    worse = max(options.blurred_ratio * _usual_blur(photos), options.blurred_min_px)
-    limit = min(worse, options.blurred_px)
+    worse = max(BLURRED_RATIO * _usual_blur(photos), BLURRED_MIN_PX)
+    limit = min(worse, BLURRED_PX)
     # Edges of white areas look soft, so overexposed photos are not checked.
-    blurred = [p.name for p in photos if p.check.blur_px > limit and p.check.clipped <= options.clipped]
+    blurred = [p.name for p in photos if p.check.blur_px > limit and p.check.clipped <= CLIPPED]
     if not blurred:
         return []
     advice = "focus on the part, hold the camera still and give it more light"
@@ -230,12 +249,12 @@ def _usual_blur(photos: Sequence[ReadPhoto]) -> float:
     return float(np.median(blurs)) if blurs else 0.0
 
 
-def _exposure_warnings(photos: Sequence[ReadPhoto], options: CheckOptions) -> list[str]:
+def _exposure_warnings(photos: Sequence[ReadPhoto]) -> list[str]:
     """Warnings about overexposed and dark photos."""
     usual = float(np.median([photo.check.clipped for photo in photos])) if photos else 0.0
-    limit = min(options.clipped, usual + options.clipped_more)
+    limit = min(CLIPPED, usual + CLIPPED_MORE)
     bright = [photo.name for photo in photos if photo.check.clipped > limit]
-    dark = [photo.name for photo in photos if photo.check.level_95 < options.dark_level]
+    dark = [photo.name for photo in photos if photo.check.level_95 < DARK_LEVEL]
     warnings = []
     if bright:
         warnings.append(f"{_counted(bright, len(photos), 'overexposed')}: white areas cannot be measured; expose less")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -13,7 +13,7 @@ from arview.camera.exif import PhotoExif
 from arview.core.atomic import write_file
 from arview.core.progress import StepProgress
 from arview.errors import InputError
-from arview.reconstruction.intake.checks import CheckOptions, check_photo, thumbnail
+from arview.reconstruction.intake.checks import check_photo, thumbnail
 from arview.reconstruction.intake.photos import MIN_PHOTOS, Intake, ReadPhoto, assess, read_and_check
 from arview.reconstruction.intake.reading import GLANCE_PX, Pixels
 from arview.video import Frame, FrameSource, open_source
@@ -23,21 +23,26 @@ _MIN_TRACKED = 20  # tracked corners below which the track has broken
 _MIN_TRACKED_SHARE = 0.3  # the same as a share of the corners found
 
 
+MIN_STEP = 0.025
+"""Of the diagonal between frames: about 6° around a part that fills a third of the picture."""
+LOOKS_PER_S = 10.0
+"""Frames examined per second; a hand-held camera hardly moves in a tenth of a second."""
+TRACKED_PX = 480
+"""Longest side of the pictures in which motion is tracked."""
+MIDDLE = 0.7
+"""Share of each step from which its frame is chosen, so that two frames are not adjacent."""
+
+
 @dataclass(frozen=True)
 class VideoIntakeOptions:
     """How frames are chosen. Raises InputError for values that choose none."""
 
     max_frames: int = 60  # number that sparse reconstruction places in about a minute
-    min_step: float = 0.025  # of the diagonal between frames: about 6° around a part that fills a third of the picture
-    looks_per_s: float = 10.0  # frames examined per second; a hand-held camera hardly moves in a tenth of a second
-    tracked_px: int = 480  # longest side of the pictures in which motion is tracked
-    middle: float = 0.7  # share of each step from which its frame is chosen, so that two frames are not adjacent
-    checks: CheckOptions = field(default_factory=CheckOptions)
 
     def __post_init__(self) -> None:
-        if self.max_frames < MIN_PHOTOS or not self.min_step > 0 or not self.looks_per_s > 0:
+        if self.max_frames < MIN_PHOTOS or not MIN_STEP > 0 or not LOOKS_PER_S > 0:
             raise InputError(
-                f"max_frames {self.max_frames}, min_step {self.min_step}, looks_per_s {self.looks_per_s}: expected at "
+                f"max_frames {self.max_frames}, min_step {MIN_STEP}, looks_per_s {LOOKS_PER_S}: expected at "
                 f"least {MIN_PHOTOS} frames and positive numbers"
             )
 
@@ -70,10 +75,10 @@ def intake_video(
     with open_source(path) as source:
         if source.is_live:
             raise InputError(f"{path}: is a live source; record a video first and give its file")
-        stride = max(1, round((source.fps or 30.0) / options.looks_per_s))
+        stride = max(1, round((source.fps or 30.0) / LOOKS_PER_S))
     with open_source(path, stride=stride) as source:
         total = 2 * (source.frame_count or 0)
-        indices, travel, sharpness = _measure_motion(source, options, progress, total)
+        indices, travel, sharpness = _measure_motion(source, progress, total)
         chosen = {indices[k] for k in choose_frames(travel, sharpness, options)}
         if len(chosen) < MIN_PHOTOS:
             raise InputError(
@@ -89,7 +94,7 @@ def intake_video(
             if len(seen) == len(chosen):
                 break
         notes = tuple(note for note in (*source.notes, source.ended_reason) if note)
-    intake = assess(str(path), seen, {}, camera, options.checks)
+    intake = assess(str(path), seen, {}, camera)
     return replace(intake, warnings=(*intake.warnings, *notes))
 
 
@@ -117,17 +122,17 @@ def intake_frames(
             rejected[frame.name] = result
         if progress:
             progress(done, len(frames))
-    return assess(str(path), seen, rejected, camera, options.checks)
+    return assess(str(path), seen, rejected, camera)
 
 
 def choose_frames(
     travel: NDArray[np.float64], sharpness: NDArray[np.float64], options: VideoIntakeOptions
 ) -> list[int]:
     """Indices of the sharpest frame in the middle of each of equal steps of ``travel`` (N,), which never decreases."""
-    count = min(options.max_frames, int(travel[-1] / options.min_step) + 1)
+    count = min(options.max_frames, int(travel[-1] / MIN_STEP) + 1)
     place = travel / max(travel[-1], 1e-12) * count
     step = np.minimum(place.astype(int), count - 1)
-    in_middle = np.abs(place - step - 0.5) <= 0.5 * options.middle
+    in_middle = np.abs(place - step - 0.5) <= 0.5 * MIDDLE
     chosen = []
     for k in range(count):
         candidates = np.flatnonzero((step == k) & in_middle)
@@ -139,18 +144,18 @@ def choose_frames(
 
 
 def _measure_motion(
-    source: FrameSource, options: VideoIntakeOptions, progress: StepProgress | None, total: int
+    source: FrameSource, progress: StepProgress | None, total: int
 ) -> tuple[list[int], NDArray[np.float64], NDArray[np.float64]]:
     """Index of each frame, accumulated motion of the picture (diagonals, non-decreasing), and its sharpness."""
     indices: list[int] = []
     travel: list[float] = []
     sharpness: list[float] = []
-    motion = _Motion(options)
+    motion = _Motion()
     for done, frame in enumerate(source, 1):
         gray = cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY)
-        travel.append(motion.add(_shrunk(gray, options.tracked_px)))
+        travel.append(motion.add(_shrunk(gray, TRACKED_PX)))
         # Neighbouring frames show the same, so the contrast of fine detail is a measure of sharpness.
-        sharpness.append(float(cv2.Laplacian(_shrunk(gray, 2 * options.tracked_px), cv2.CV_32F).var()))
+        sharpness.append(float(cv2.Laplacian(_shrunk(gray, 2 * TRACKED_PX), cv2.CV_32F).var()))
         indices.append(frame.index)
         if progress and total:
             progress(min(done, total // 2), total)
@@ -162,8 +167,8 @@ def _measure_motion(
 class _Motion:
     """Accumulates the picture's motion: corners are tracked from a reference that is renewed after each real move."""
 
-    def __init__(self, options: VideoIntakeOptions) -> None:
-        self._lost_step = options.min_step  # added when the track breaks, because the view has changed
+    def __init__(self) -> None:
+        self._lost_step = MIN_STEP  # added when the track breaks, because the view has changed
         self._travelled = 0.0
         self._previous: Pixels | None = None
         self._reference: NDArray[np.float32] | None = None  # (N,1,2) px, in the reference picture

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -20,7 +20,7 @@ from arview.detection import Detector
 from arview.geometry import Array, invert, rigid
 from arview.guideviews import GuideViewOptions, GuideViewSet
 from arview.guideviews.cache import cached_guide_views
-from arview.reconstruction.scale.refine import Fit, JointRefiner, RefineOptions, ScaleView, Support
+from arview.reconstruction.scale.refine import Fit, JointRefiner, ScaleView, Support
 from arview.reconstruction.scale.similarity import Similarity
 from arview.reconstruction.scale.vote import Sighting, Vote, vote
 from arview.reconstruction.types import PosedPhoto
@@ -32,48 +32,47 @@ FOUND_QUALITY = 0.5
 """Quality from which a detection is reliable by itself."""
 
 
+DETECT_WIDTH_PX = 800
+"""Longer side of the pictures in which the part is searched for."""
+MAX_DETECTIONS = 12
+"""Maximum number of photos searched."""
+MORE_DETECTIONS = 30
+"""Maximum number of photos searched where some show the part reliably, but too few: much of it is hidden."""
+FIRST_DETECTIONS = 6
+"""Maximum number of photos searched while none shows the part reliably."""
+AGREEING = 3
+"""Number of agreeing photos that ends the search."""
+MIN_QUALITY = 0.1
+"""Detections of at least this quality vote, even if they would not be reliable by themselves."""
+SIGHTINGS = 5
+"""Maximum number of detections per photo."""
+SUBDIVISIONS = 3
+"""Of the guide views' directions; 3 is about 8° apart, enough for a start."""
+SPANS = (0.2, 1.2)
+"""Smallest and largest share of the photo's longer side that the part is expected to span."""
+MIN_SUPPORT = 0.25
+"""Minimum support of a similarity that is accepted, see `Support`."""
+CLEAR_SUPPORT = 0.6
+"""Support of a component that is seen as it should be …."""
+MIN_CLEAR = 2
+"""… and number of such components with which a part is accepted of which the rest is hidden."""
+CLEAR_LEAD = 0.08
+"""An alternative whose support is less than this below the best one's makes the frame ambiguous."""
+
+
 @dataclass(frozen=True)
 class CadOptions:
     """Options of finding the CAD in the photos.
 
     Attributes:
-        detect_width_px: longer side of the pictures in which the part is searched for.
-        max_detections: maximum number of photos searched.
-        first_detections: maximum number of photos searched while none shows the part reliably.
-        more_detections: maximum number of photos searched where some show the part reliably, but too few: much of it is
-            hidden.
-        agreeing: number of agreeing photos that ends the search.
-        min_quality: detections of at least this quality vote, even if they would not be reliable by themselves.
-        sightings: maximum number of detections per photo.
-        subdivisions: of the guide views' directions; 3 is about 8° apart, enough for a start.
-        spans: smallest and largest share of the photo's longer side that the part is expected to span.
         max_side_px: photos are refined at no larger size, to limit memory.
         max_views: maximum number of photos refined, spread over all directions, to limit time.
         rival_views: number of photos in which alternatives to the best vote are scored.
-        min_support: minimum support of a similarity that is accepted, see `Support`.
-        clear_support: support of a component that is seen as it should be …
-        min_clear: … and number of such components with which a part is accepted of which the rest is hidden.
-        clear_lead: an alternative whose support is less than this below the best one's makes the frame ambiguous.
-        refine: options of the joint refinement.
     """
 
-    detect_width_px: int = 800
-    max_detections: int = 12
-    more_detections: int = 30
-    first_detections: int = 6
-    agreeing: int = 3
-    min_quality: float = 0.1
-    sightings: int = 5
-    subdivisions: int = 3
-    spans: tuple[float, float] = (0.2, 1.2)
     max_side_px: int = 2000
     max_views: int = 30
     rival_views: int = 6
-    min_support: float = 0.25
-    clear_support: float = 0.6
-    min_clear: int = 2
-    clear_lead: float = 0.08
-    refine: RefineOptions = field(default_factory=RefineOptions)
 
 
 @dataclass(frozen=True)
@@ -190,14 +189,18 @@ def find_cad(
         return NotFound("fewer than two photos were placed")
     order = spread_order(photos)
     reasons: list[NotFound] = []
-    for view_range in search_ranges(part, [photo.camera for photo in photos], options.spans):
+    for view_range in search_ranges(part, [photo.camera for photo in photos], SPANS):
         views = cached_guide_views(
-            part.model, view_range, GuideViewOptions(subdivisions=options.subdivisions),
+            part.model,
+            view_range,
+            GuideViewOptions(subdivisions=SUBDIVISIONS),
             progress=lambda done, total: progress("guide views", done, total) if progress else None,
-        )  # fmt: skip
-        votes, turns, reason = _search(photos, order, read, views, options, progress)
+        )
+        votes, turns, reason = _search(photos, order, read, views, progress)
         if votes:
-            return _refined(photos, order, read, part, votes, turns, options, progress)
+            return _refined(
+                photos, order, read, part=part, votes=votes, turns=turns, options=options, progress=progress
+            )
         reasons.append(reason)
         if reason.is_contradiction:
             break
@@ -209,7 +212,6 @@ def _search(
     order: Sequence[int],
     read: Callable[[PosedPhoto], Pixels],
     views: GuideViewSet,
-    options: CadOptions,
     progress: Progress | None,
 ) -> tuple[list[Vote], Array, NotFound]:
     """Votes of the detections, rotations (N,3,3) under which the part looks similar, and the reason without a vote."""
@@ -221,19 +223,19 @@ def _search(
     votes: list[Vote] = []
     reasons: list[str] = []
     sure = 0
-    enough = min(options.agreeing, len(photos))
-    for count, index in enumerate(order[: options.more_detections]):
-        if count >= (options.max_detections if votes else options.first_detections) and not sure:
+    enough = min(AGREEING, len(photos))
+    for count, index in enumerate(order[:MORE_DETECTIONS]):
+        if count >= (MAX_DETECTIONS if votes else FIRST_DETECTIONS) and not sure:
             break
         if progress:
-            progress("finding the part", count, min(len(order), options.max_detections))
-        camera, image = shrunk(photos[index].camera, read(photos[index]), options.detect_width_px)
+            progress("finding the part", count, min(len(order), MAX_DETECTIONS))
+        camera, image = shrunk(photos[index].camera, read(photos[index]), DETECT_WIDTH_PX)
         key = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, *camera.dist)
         detector = detectors.get(key)
         if detector is None:
-            unsure = replace(options_for(views), min_quality=options.min_quality)
+            unsure = replace(options_for(views), min_quality=MIN_QUALITY)
             detector = detectors[key] = Detector(views, camera, unsure)
-        found = detector.detect(image, options.sightings)
+        found = detector.detect(image, SIGHTINGS)
         if found and found[0].quality >= FOUND_QUALITY:
             sure += 1
         elif not found:
@@ -272,7 +274,7 @@ def _refined(
         if progress:
             progress("reading photos", len(views), len(chosen))
     base, model = base_names(part), part.model
-    scorer = JointRefiner(model, base, views[: options.rival_views], options.refine)
+    scorer = JointRefiner(model, base, views[: options.rival_views])
     starts = [v.similarity for v in votes[:3] if v.score >= 0.4 * votes[0].score]
     starts += [_turned(votes[0].similarity, turn, model) for turn in turns]
     scored = []
@@ -282,17 +284,18 @@ def _refined(
     scored.sort(key=lambda pair: -pair[0])
     warnings = []
     rivals = [score for score, other in scored[1:] if _is_other(scored[0][1], other)]
-    if rivals and scored[0][0] - max(rivals) < options.clear_lead:
+    if rivals and scored[0][0] - max(rivals) < CLEAR_LEAD:
         warnings.append("the part looks similar after a rotation, so the frame may be wrong by that rotation")
     if progress:
         progress("fitting the CAD", 0, 1)
-    refiner = JointRefiner(model, base, views, options.refine)
+    refiner = JointRefiner(model, base, views)
     fit = refiner.refine(scored[0][1])
     support = refiner.support(fit.similarity, fit.samples)
-    is_whole = max(support.score, support.base_score) >= options.min_support
-    clear = [one.name for one, share in zip(model.components, support.by_component, strict=True)
-             if share >= options.clear_support]  # fmt: skip
-    if not is_whole and len(clear) >= options.min_clear:
+    is_whole = max(support.score, support.base_score) >= MIN_SUPPORT
+    clear = [
+        one.name for one, share in zip(model.components, support.by_component, strict=True) if share >= CLEAR_SUPPORT
+    ]
+    if not is_whole and len(clear) >= MIN_CLEAR:
         warnings.append(
             f"only some of the part is in view: of the edges of {len(model.components)} components those of "
             f"{', '.join(clear)} were clearly found"

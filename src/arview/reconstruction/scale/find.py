@@ -84,9 +84,15 @@ def find_scale(
         consistency = Consistency(False, no_fit.reason) if no_fit.is_contradiction else NO_CHECK
         warnings += [no_fit.reason] if no_fit.is_contradiction else []
         return ScaleResult(
-            combined.scale if combined else None, combined.std if combined else None, None, None,
-            combined.evidence if combined else (), tuple(warnings), no_fit.reason, consistency,
-        )  # fmt: skip
+            combined.scale if combined else None,
+            combined.std if combined else None,
+            None,
+            covariance=None,
+            evidence=combined.evidence if combined else (),
+            warnings=tuple(warnings),
+            why_no_frame=no_fit.reason,
+            consistency=consistency,
+        )
     # The change of scale by the other sources moves the frame by as much as the two are correlated.
     fit = found.fit
     change = float(np.log(combined.scale / fit.similarity.scale))
@@ -104,9 +110,15 @@ def find_scale(
     if not consistency.is_consistent:
         warnings.append(consistency.reason)
     return ScaleResult(
-        combined.scale, combined.std, similarity.model_from_scan, _positive(covariance), combined.evidence,
-        tuple(warnings), "", consistency,
-    )  # fmt: skip
+        combined.scale,
+        combined.std,
+        similarity.model_from_scan,
+        covariance=_positive(covariance),
+        evidence=combined.evidence,
+        warnings=tuple(warnings),
+        why_no_frame="",
+        consistency=consistency,
+    )
 
 
 def combine(evidence: Sequence[ScaleEvidence]) -> CombinedScale | None:

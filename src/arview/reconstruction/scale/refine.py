@@ -41,43 +41,36 @@ class ScaleView:
     cam_from_scan: Array
 
 
-@dataclass(frozen=True)
-class RefineOptions:
-    """Options of the joint refinement.
-
-    Attributes:
-        rough_reaches_px: search range across the edges in each round from a distant start, in px of the views.
-        reaches_px: search range in each round from a near start.
-        spacing_px: between samples along an edge, in px of the views.
-        drawn_width_px: longer side at which hidden edges are determined.
-        half_width_px: profiles are averaged over this distance to either side along the edge.
-        threshold: weakest step, in grey levels (of 255) per px in linear light.
-        half_slope: slope at which a step has half its full weight.
-        contact_px: edges this near to a surface of another component, in rendered px, are joints (and often welds).
-        min_sigma_px: lower bound of the residuals' standard deviation: lens, tessellation, pixel response.
-        near_px: distance up to which a step supports an edge.
-        beside_px: distance beside the edges at which chance is measured.
-        dark_shift_px: standard deviation of a common shift of all edges to the dark side: tone curve, glare.
-        min_displacement_mm: lower bound of the width of the prior on displacements.
-        base_sigma_mm: standard deviation of an error of the base's edges: shadows, a bench of the same colour.
-        systematic_px: standard deviation of a common error of all edges, for the uncertainty: chamfers, tone curve.
-    """
-
-    rough_reaches_px: tuple[float, ...] = (12.0, 10.0, 7.0, 5.0)
-    reaches_px: tuple[float, ...] = (7.0, 5.0, 3.5, 3.0, 3.0, 3.0)
-    spacing_px: float = 6.0
-    drawn_width_px: int = 800
-    half_width_px: float = 3.0
-    threshold: float = 1.0
-    half_slope: float = 6.0
-    contact_px: float = 3.0
-    min_sigma_px: float = 0.1
-    near_px: float = 1.5
-    beside_px: float = 9.0
-    dark_shift_px: float = 0.1
-    min_displacement_mm: float = 0.05
-    base_sigma_mm: float = 0.05
-    systematic_px: float = 0.05
+ROUGH_REACHES_PX: tuple[float, ...] = (12.0, 10.0, 7.0, 5.0)
+"""Search range across the edges in each round from a distant start, in px of the views."""
+REACHES_PX: tuple[float, ...] = (7.0, 5.0, 3.5, 3.0, 3.0, 3.0)
+"""Search range in each round from a near start."""
+SPACING_PX = 6.0
+"""Between samples along an edge, in px of the views."""
+DRAWN_WIDTH_PX = 800
+"""Longer side at which hidden edges are determined."""
+HALF_WIDTH_PX = 3.0
+"""Profiles are averaged over this distance to either side along the edge."""
+THRESHOLD = 1.0
+"""Weakest step, in grey levels (of 255) per px in linear light."""
+HALF_SLOPE = 6.0
+"""Slope at which a step has half its full weight."""
+CONTACT_PX = 3.0
+"""Edges this near to a surface of another component, in rendered px, are joints (and often welds)."""
+MIN_SIGMA_PX = 0.1
+"""Lower bound of the residuals' standard deviation: lens, tessellation, pixel response."""
+NEAR_PX = 1.5
+"""Distance up to which a step supports an edge."""
+BESIDE_PX = 9.0
+"""Distance beside the edges at which chance is measured."""
+DARK_SHIFT_PX = 0.1
+"""Standard deviation of a common shift of all edges to the dark side: tone curve, glare."""
+MIN_DISPLACEMENT_MM = 0.05
+"""Lower bound of the width of the prior on displacements."""
+BASE_SIGMA_MM = 0.05
+"""Standard deviation of an error of the base's edges: shadows, a bench of the same colour."""
+SYSTEMATIC_PX = 0.05
+"""Standard deviation of a common error of all edges, for the uncertainty: chamfers, tone curve."""
 
 
 @dataclass(frozen=True)
@@ -166,36 +159,36 @@ class EdgeResiduals:
 class JointRefiner:
     """Refines similarities of one model in some views."""
 
-    def __init__(self, model: Model, base: Sequence[str], views: Sequence[ScaleView], options: RefineOptions) -> None:
+    def __init__(self, model: Model, base: Sequence[str], views: Sequence[ScaleView]) -> None:
         self.model = model
         self.views = tuple(views)
-        self.options = options
         self.center = model.center_in_model
         self._edges = mesh_edges(model)
         self._is_base = np.array([component.name in base for component in model.components])
 
     def samples(self, view: ScaleView, cam_from_model: Array) -> CadEdgePoints:
         """Edge points that the view shows, without joints between components and folds of curved surfaces."""
-        o = self.options
-        shrink = min(1.0, o.drawn_width_px / max(view.camera.width, view.camera.height))
+        shrink = min(1.0, DRAWN_WIDTH_PX / max(view.camera.width, view.camera.height))
         drawn = view.camera.without_distortion().scaled(
             round(view.camera.width * shrink), round(view.camera.height * shrink)
         )
         rendering = ZBufferRenderer(self.model, drawn).render(cam_from_model)
         lens = (drawn.fx, drawn.fy, drawn.cx, drawn.cy)
-        found = sample_visible_edges(self._edges, cam_from_model, lens, rendering.depth_mm, o.spacing_px * shrink)
+        found = sample_visible_edges(self._edges, cam_from_model, lens, rendering.depth_mm, SPACING_PX * shrink)
         depth = apply(cam_from_model, found.points_in_model)[:, 2]
         normals = self._normals(drawn, cam_from_model, found.points_in_model, found.tangents_in_model)
         is_good = (found.kinds & (EDGE_SHARP | EDGE_SILHOUETTE)) > 0
-        for side in (-o.contact_px, o.contact_px):
+        for side in (-CONTACT_PX, CONTACT_PX):
             u, v = np.round(found.pixels + side * normals).astype(np.intp).T
             u, v = np.clip(u, 0, drawn.width - 1), np.clip(v, 0, drawn.height - 1)
             other = rendering.component_ids[v, u]
-            is_near = np.abs(rendering.depth_mm[v, u] - depth) < 2.0 * o.contact_px * depth / drawn.fx
+            is_near = np.abs(rendering.depth_mm[v, u] - depth) < 2.0 * CONTACT_PX * depth / drawn.fx
             is_good &= ~((other >= 0) & (other != found.component) & is_near)
         points, tangents, component = (
-            found.points_in_model[is_good], found.tangents_in_model[is_good], found.component[is_good]
-        )  # fmt: skip
+            found.points_in_model[is_good],
+            found.tangents_in_model[is_good],
+            found.component[is_good],
+        )
         return CadEdgePoints(points, tangents, component, self._features(points, tangents, component))
 
     def rough(self, start: Similarity) -> tuple[Similarity, Support]:
@@ -204,7 +197,7 @@ class JointRefiner:
         """
         tried = []
         for components in (np.ones_like(self._is_base), self._is_base):
-            fit = self.refine(start, self.options.rough_reaches_px, components)
+            fit = self.refine(start, ROUGH_REACHES_PX, components)
             tried.append((fit.similarity, self.support(fit.similarity)))
             if self._is_base.all():
                 break
@@ -219,15 +212,14 @@ class JointRefiner:
         """Refine from a near start to the similarity on which the edges of all views, or of some ``components`` (C,),
         agree.
         """
-        o = self.options
-        reaches = reaches_px or o.reaches_px
+        reaches = reaches_px or REACHES_PX
         similarity, samples = start, self.sample_all(start, components)
         displacements = np.zeros((len(self._is_base), 3))
         for index, reach_px in enumerate(reaches):
             if index == len(reaches) - 2:
                 samples = self.sample_all(similarity, components)
             measured = self.measure_all(similarity, samples, reach_px)
-            system = _JointSystem(measured, displacements, self._is_base, o)
+            system = _JointSystem(measured, displacements, self._is_base)
             step, displacements = system.solve()
             similarity = similarity.moved(step, self.center)
         covariance = system.covariance() + self._systematic(similarity, samples)
@@ -242,17 +234,16 @@ class JointRefiner:
         pixels = [
             apply(similarity.cam_from_model(view.cam_from_scan), self.center)[2] / view.camera.fx for view in self.views
         ]
-        sigma_mm = self.options.systematic_px * float(np.median(pixels))
-        shift_mm = float(np.hypot(sigma_mm, self.options.base_sigma_mm))
+        sigma_mm = SYSTEMATIC_PX * float(np.median(pixels))
+        shift_mm = float(np.hypot(sigma_mm, BASE_SIGMA_MM))
         return np.diag(np.repeat([sigma_mm / radius_mm, shift_mm, sigma_mm / radius_mm], [3, 3, 1]) ** 2)
 
     def support(self, similarity: Similarity, samples: Sequence[CadEdgePoints] | None = None) -> Support:
         """Share of predicted edges that the views show, compared with the share found beside them."""
-        o = self.options
         samples = samples or self.sample_all(similarity)
         counts = []
-        for shift_px in (0.0, -o.beside_px, o.beside_px):
-            measured = self.measure_all(similarity, samples, 2.0 * o.near_px, shift_px)
+        for shift_px in (0.0, -BESIDE_PX, BESIDE_PX):
+            measured = self.measure_all(similarity, samples, 2.0 * NEAR_PX, shift_px)
             counts.append([np.stack([m.searched for m in measured]), np.stack([m.found for m in measured])])
         (searched, found), (left, by_left), (right, by_right) = counts
 
@@ -274,32 +265,42 @@ class JointRefiner:
 
         With ``shift_px`` the search is beside the edges, where steps are found by chance.
         """
-        o = self.options
         in_cam = apply(cam_from_model, samples.points)
         pixels = view.camera.project(in_cam)
         normals = self._normals(view.camera, cam_from_model, samples.points, samples.tangents)
         all_offsets, all_slopes, seen = find_steps(
-            view.gray, pixels + shift_px * normals, normals, reach_px, o.half_width_px, o.threshold
+            view.gray, pixels + shift_px * normals, normals, reach_px, HALF_WIDTH_PX, THRESHOLD
         )
-        offsets, slopes = choose_steps(all_offsets, all_slopes, 0.4 * reach_px, o.half_slope)
+        offsets, slopes = choose_steps(all_offsets, all_slopes, 0.4 * reach_px, HALF_SLOPE)
         is_found = seen & (slopes != 0.0)
         # Numerical derivative through the lens, with steps of one micrometre per mm of depth.
         delta = 1e-6 * in_cam[:, 2:]
-        by_cam = np.stack([
-            np.sum((view.camera.project(in_cam + delta * axis) - pixels) * normals, axis=1) / delta[:, 0]
-            for axis in np.eye(3)
-        ], axis=1)  # fmt: skip
+        by_cam = np.stack(
+            [
+                np.sum((view.camera.project(in_cam + delta * axis) - pixels) * normals, axis=1) / delta[:, 0]
+                for axis in np.eye(3)
+            ],
+            axis=1,
+        )
         by_model = by_cam @ cam_from_model[:3, :3]
-        rows = np.concatenate([
-            np.cross(samples.points - self.center, by_model), by_model,
-            (by_cam @ apply(cam_from_model, self.center))[:, None], np.sign(slopes)[:, None],
-        ], axis=1)  # fmt: skip
+        rows = np.concatenate(
+            [
+                np.cross(samples.points - self.center, by_model),
+                by_model,
+                (by_cam @ apply(cam_from_model, self.center))[:, None],
+                np.sign(slopes)[:, None],
+            ],
+            axis=1,
+        )
         count = len(self._is_base)
         return EdgeResiduals(
-            rows[is_found], offsets[is_found], samples.component[is_found], samples.feature[is_found],
+            rows[is_found],
+            offsets[is_found],
+            samples.component[is_found],
+            samples.feature[is_found],
             np.bincount(samples.component[seen], minlength=count),
             np.bincount(samples.component[is_found & (np.abs(offsets) < 0.5 * reach_px)], minlength=count),
-        )  # fmt: skip
+        )
 
     def measure_all(
         self, start: Similarity, samples: Sequence[CadEdgePoints], reach_px: float, shift_px: float = 0.0
@@ -351,9 +352,7 @@ def _mean(values: Array) -> float:
 class _JointSystem:
     """Equations of one round: 8 common unknowns, and 3 for each component that may be displaced."""
 
-    def __init__(
-        self, measured: Sequence[EdgeResiduals], displacements: Array, is_base: NDArray[np.bool_], o: RefineOptions
-    ) -> None:
+    def __init__(self, measured: Sequence[EdgeResiduals], displacements: Array, is_base: NDArray[np.bool_]) -> None:
         self.rows = np.concatenate([m.rows for m in measured])
         self.offsets = np.concatenate([m.offsets for m in measured])
         self.component = np.concatenate([m.component for m in measured])
@@ -362,13 +361,13 @@ class _JointSystem:
         self.is_base = is_base
         # Residuals with each component at the place that the previous round found.
         left = self.offsets - np.sum(self.rows[:, 3:6] * displacements[self.component], axis=1)
-        self.sigma_px = max(o.min_sigma_px, 1.4826 * float(np.median(np.abs(left))) if len(left) else np.inf)
+        self.sigma_px = max(MIN_SIGMA_PX, 1.4826 * float(np.median(np.abs(left))) if len(left) else np.inf)
         self.weights = np.clip(1.0 - (left / (4.685 * self.sigma_px)) ** 2, 0.0, None) ** 2 / self.sigma_px**2
         moving = np.linalg.norm(displacements[~is_base], axis=1)
-        width_mm = max(o.min_displacement_mm, 0.6 * float(np.median(moving)) if len(moving) else 0.0)
+        width_mm = max(MIN_DISPLACEMENT_MM, 0.6 * float(np.median(moving)) if len(moving) else 0.0)
         # Student's t with one degree of freedom in three dimensions.
-        self.prior = np.where(is_base, 1.0 / o.base_sigma_mm**2, 4.0 / (width_mm**2 + np.sum(displacements**2, axis=1)))
-        self.dark_prior = 1.0 / o.dark_shift_px**2
+        self.prior = np.where(is_base, 1.0 / BASE_SIGMA_MM**2, 4.0 / (width_mm**2 + np.sum(displacements**2, axis=1)))
+        self.dark_prior = 1.0 / DARK_SHIFT_PX**2
 
     def solve(self) -> tuple[Array, Array]:
         """Step (7,) of the similarity, and displacements (C,3) of the components."""
@@ -402,9 +401,7 @@ class _JointSystem:
         The cluster-robust estimate (Liang & Zeger 1986), summed over these three groupings of the residuals.
         """
         total = np.zeros((8, 8))
-        for labels, rows in (
-            (self.view, self.projected), (self.feature, self.projected), (self.component, self.rows)
-        ):  # fmt: skip
+        for labels, rows in ((self.view, self.projected), (self.feature, self.projected), (self.component, self.rows)):
             groups, inverse = np.unique(labels, return_inverse=True)
             if len(groups) < 2:
                 continue

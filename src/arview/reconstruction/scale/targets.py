@@ -7,7 +7,6 @@ reconstruction; their known distances then give millimetres per unit.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,33 +21,24 @@ from arview.reconstruction.scale.triangulation import TriangulatedCorners, trian
 from arview.reconstruction.scale.types import ScaleEvidence
 from arview.reconstruction.types import PosedPhoto
 
-
-@dataclass(frozen=True)
-class TargetOptions:
-    """Uncertainty assumed for targets and rigs.
-
-    Attributes:
-        print_std: relative standard deviation of the size of a printed target.
-        tag_edge_std_px: standard deviation of a common shift of all sides of tags, outwards or inwards, by the unknown
-            tone curve. Chessboard corners and the centres of tags are not affected.
-        min_board_corners: corners that a board needs for its scale.
-        single_distance_std: relative standard deviation of one distance between cameras; the residuals of several
-            show it, that of one does not.
-        min_rig_std: lower bound of the relative standard deviation from distances between cameras.
-    """
-
-    print_std: float = 2e-4
-    tag_edge_std_px: float = 0.1
-    min_board_corners: int = 4
-    single_distance_std: float = 1e-3
-    min_rig_std: float = 1e-6
+PRINT_STD = 2e-4
+"""Relative standard deviation of the size of a printed target."""
+TAG_EDGE_STD_PX = 0.1
+"""Standard deviation of a common shift of all sides of tags, outwards or inwards, by the unknown tone curve. Chessboard
+corners and the centres of tags are not affected."""
+MIN_BOARD_CORNERS = 4
+"""Corners that a board needs for its scale."""
+SINGLE_DISTANCE_STD = 1e-3
+"""Relative standard deviation of one distance between cameras; the residuals of several show it, that of one does
+not."""
+MIN_RIG_STD = 1e-6
+"""Lower bound of the relative standard deviation from distances between cameras."""
 
 
 def scale_from_targets(
     photos: Sequence[PosedPhoto],
     read_gray: Callable[[PosedPhoto], NDArray[np.uint8]],
     sources: ScaleSources,
-    options: TargetOptions | None = None,
 ) -> tuple[list[ScaleEvidence], list[str]]:
     """Scale evidence of the boards, tags and scale bars in view, and messages about those not found.
 
@@ -56,9 +46,7 @@ def scale_from_targets(
         photos: placed photos.
         read_gray: returns the upright (H,W) uint8 picture of a photo, of the size of its camera.
         sources: the targets that may be in view.
-        options: see `TargetOptions`.
     """
-    o = options or TargetOptions()
     if not (sources.boards or sources.tags or sources.bars):
         return [], []
     dictionaries = {tags.dictionary for tags in sources.tags} | {bar.dictionary for bar in sources.bars}
@@ -71,30 +59,26 @@ def scale_from_targets(
     evidence: list[ScaleEvidence] = []
     missing: list[str] = []
     for number, board in enumerate(sources.boards):
-        _add(evidence, missing, _board_evidence(board, number, corners, o), str(board))
+        _add(evidence, missing, _board_evidence(board, number, corners), str(board))
     for tags in sources.tags:
         in_boards = {
             int(i) for b in sources.boards if b.dictionary == tags.dictionary for i in cv_board(b).getIds().ravel()
         }
         what = f"tags {tags.dictionary.removeprefix('DICT_')} of {tags.side_mm:g} mm"
-        _add(evidence, missing, _tag_evidence(tags, in_boards, corners, _side_px(found, tags), what, o), what)
+        _add(evidence, missing, _tag_evidence(tags, in_boards, corners, _side_px(found, tags), what), what)
     for bar in sources.bars:
         what = f"scale bar from tag {bar.first} to tag {bar.second}, {bar.length_mm:g} mm"
         _add(evidence, missing, _bar_evidence(bar, corners, what), what)
     return evidence, missing
 
 
-def scale_from_rig(
-    photos: Sequence[PosedPhoto], rig: Rig, options: TargetOptions | None = None
-) -> tuple[list[ScaleEvidence], list[str]]:
+def scale_from_rig(photos: Sequence[PosedPhoto], rig: Rig) -> tuple[list[ScaleEvidence], list[str]]:
     """Scale evidence of known camera positions and distances, and messages about what was missing.
 
     Args:
         photos: placed photos.
         rig: what is known about their cameras.
-        options: see `TargetOptions`.
     """
-    o = options or TargetOptions()
     centres = {photo.name: photo.centre_in_scan for photo in photos}
     evidence: list[ScaleEvidence] = []
     missing: list[str] = []
@@ -112,15 +96,15 @@ def scale_from_rig(
         mm = np.array([mm for _, _, mm in known])
         scale = float(lengths @ mm / (lengths @ lengths))
         left = mm - scale * lengths
-        std = float(np.sqrt(left @ left / (len(known) - 1) / (mm @ mm))) if len(known) > 1 else o.single_distance_std
+        std = float(np.sqrt(left @ left / (len(known) - 1) / (mm @ mm))) if len(known) > 1 else SINGLE_DISTANCE_STD
         detail = f"camera rig: {len(known)} distances between cameras, {np.sqrt(np.mean(left**2)):.2f} mm rms"
-        evidence.append(ScaleEvidence("rig", scale, max(std, o.min_rig_std), detail))
+        evidence.append(ScaleEvidence("rig", scale, max(std, MIN_RIG_STD), detail))
     elif rig.distances_mm:
         missing.append("camera rig: no distance is between two photos that were placed")
     return evidence, missing
 
 
-def _board_evidence(board: Board, number: int, corners: TriangulatedCorners, o: TargetOptions) -> ScaleEvidence | None:
+def _board_evidence(board: Board, number: int, corners: TriangulatedCorners) -> ScaleEvidence | None:
     """Scale of a similarity from the triangulated corners of a board to their places on it."""
     drawn = cv_board(board)
     on_board: dict[CornerKey, Array] = {}
@@ -132,24 +116,26 @@ def _board_evidence(board: Board, number: int, corners: TriangulatedCorners, o: 
             for corner, place in enumerate(quad):
                 on_board[board.dictionary, int(marker), corner] = np.asarray(place, dtype=np.float64)
     common = [key for key in on_board if key in corners.points]
-    if len(common) < o.min_board_corners:
+    if len(common) < MIN_BOARD_CORNERS:
         return None
     fit = fit_points(np.array([corners.points[k] for k in common]), np.array([on_board[k] for k in common]))
     detail = f"{board}: {len(common)} corners, {fit.rms_mm:.3f} mm rms, {corners.sigma_px:.2f} px"
-    return ScaleEvidence("board", fit.similarity.scale, float(np.hypot(fit.scale_std, o.print_std)), detail)
+    return ScaleEvidence("board", fit.similarity.scale, float(np.hypot(fit.scale_std, PRINT_STD)), detail)
 
 
 def _side_px(corners_by_photo: Sequence[dict[CornerKey, Array]], tags: Tags) -> float:
     """Median side length, in the photos, of the tags of a dictionary."""
     sides = [
         float(np.linalg.norm(corners[key] - corners[(*key[:2], 1)]))
-        for corners in corners_by_photo for key in corners if key[0] == tags.dictionary and key[2] == 0
-    ]  # fmt: skip
+        for corners in corners_by_photo
+        for key in corners
+        if key[0] == tags.dictionary and key[2] == 0
+    ]
     return float(np.median(sides)) if sides else 1.0
 
 
 def _tag_evidence(
-    tags: Tags, in_boards: set[int], corners: TriangulatedCorners, side_px: float, what: str, o: TargetOptions
+    tags: Tags, in_boards: set[int], corners: TriangulatedCorners, side_px: float, what: str
 ) -> ScaleEvidence | None:
     """Median scale of the tags of one size; tags that belong to a board are excluded."""
     half = 0.5 * tags.side_mm
@@ -167,8 +153,8 @@ def _tag_evidence(
     middle = float(np.median(logs))
     from_residuals = float(np.median([fit.scale_std for fit in fits]))
     scatter = max(1.4826 * float(np.median(np.abs(logs - middle))), from_residuals)
-    from_tone_curve = 2.0 * o.tag_edge_std_px / side_px
-    std = float(np.linalg.norm([1.2533 * scatter / np.sqrt(len(fits)), from_tone_curve, o.print_std]))
+    from_tone_curve = 2.0 * TAG_EDGE_STD_PX / side_px
+    std = float(np.linalg.norm([1.2533 * scatter / np.sqrt(len(fits)), from_tone_curve, PRINT_STD]))
     rms_mm = float(np.sqrt(np.mean([fit.rms_mm**2 for fit in fits])))
     detail = f"{what}: {len(fits)} of them, {rms_mm:.3f} mm rms, {corners.sigma_px:.2f} px"
     return ScaleEvidence("tag", float(np.exp(middle)), std, detail)

@@ -20,23 +20,16 @@ CornerSightings = tuple[Camera, Array, NDArray[np.intp], Array]
 """One photo: camera, ``cam_from_scan``, index of each corner that it shows, and their pixels (N,2)."""
 
 
-@dataclass(frozen=True)
-class TriangulationOptions:
-    """Options of the triangulation of target corners.
-
-    Attributes:
-        min_angle_deg: corners seen under a smaller parallax are not triangulated.
-        min_sigma_px: lower bound of the standard deviation assumed for a corner.
-        max_sigmas: observations whose residual exceeds this many standard deviations are dropped.
-        huber_sigmas: residual at which Huber's weights (1964) start to fall.
-        iterations: of Gauss-Newton.
-    """
-
-    min_angle_deg: float = 2.0
-    min_sigma_px: float = 0.05
-    max_sigmas: float = 4.0
-    huber_sigmas: float = 1.5
-    iterations: int = 8
+MIN_ANGLE_DEG = 2.0
+"""Corners seen under a smaller parallax are not triangulated."""
+MIN_SIGMA_PX = 0.05
+"""Lower bound of the standard deviation assumed for a corner."""
+MAX_SIGMAS = 4.0
+"""Observations whose residual exceeds this many standard deviations are dropped."""
+HUBER_SIGMAS = 1.5
+"""Residual at which Huber's weights (1964) start to fall."""
+ITERATIONS = 8
+"""Of Gauss-Newton."""
 
 
 @dataclass(frozen=True)
@@ -58,33 +51,31 @@ def triangulate_corners(
     cameras: Sequence[Camera],
     cams_from_scan: Sequence[Array],
     corners_by_photo: Sequence[dict[CornerKey, Array]],
-    options: TriangulationOptions | None = None,
 ) -> TriangulatedCorners:
     """Triangulate every corner that at least two photos show, robustly.
 
     Args:
         cameras, cams_from_scan: of each photo; poses (4,4).
         corners_by_photo: pixels (2,) of the corners found in each photo.
-        options: see `TriangulationOptions`.
     """
-    o = options or TriangulationOptions()
     keys = sorted({key for corners in corners_by_photo for key in corners})
     index = {key: i for i, key in enumerate(keys)}
     views: list[CornerSightings] = [
         (camera, pose, np.array([index[k] for k in corners], dtype=np.intp), np.array(list(corners.values())))
-        for camera, pose, corners in zip(cameras, cams_from_scan, corners_by_photo, strict=True) if corners
-    ]  # fmt: skip
-    points, good = _linear_points(views, len(keys), o.min_angle_deg)
+        for camera, pose, corners in zip(cameras, cams_from_scan, corners_by_photo, strict=True)
+        if corners
+    ]
+    points, good = _linear_points(views, len(keys), MIN_ANGLE_DEG)
     normal = np.zeros((len(keys), 3, 3))
     sigma_px = np.inf
-    for _ in range(o.iterations):
-        normal, right, counts, errors = _normal_equations(views, points, good, sigma_px, o)
+    for _ in range(ITERATIONS):
+        normal, right, counts, errors = _normal_equations(views, points, good, sigma_px)
         good &= counts >= 2
         if not good.any():
             break
         sizes = np.concatenate(errors)
         # The median length of a two-dimensional normal error is 1.1774 σ.
-        sigma_px = max(o.min_sigma_px, float(np.median(sizes)) / 1.1774)
+        sigma_px = max(MIN_SIGMA_PX, float(np.median(sizes)) / 1.1774)
         points[good] += np.linalg.solve(normal[good], right[good][:, :, None])[:, :, 0]
     chosen = np.flatnonzero(good)
     covariances = {keys[i]: np.linalg.inv(normal[i]) * sigma_px**2 for i in chosen}
@@ -112,7 +103,7 @@ def _linear_points(
 
 
 def _normal_equations(
-    views: Sequence[CornerSightings], points: Array, good: NDArray[np.bool_], sigma_px: float, o: TriangulationOptions
+    views: Sequence[CornerSightings], points: Array, good: NDArray[np.bool_], sigma_px: float
 ) -> tuple[Array, Array, NDArray[np.int_], list[Array]]:
     """Normal matrix (N,3,3), right side (N,3), observations used (N,), and the residual lengths of each photo."""
     normal, right = np.zeros((len(points), 3, 3)), np.zeros((len(points), 3))
@@ -122,12 +113,12 @@ def _normal_equations(
         projected = camera.project(in_cam)
         residual = pixels - projected
         size = np.linalg.norm(residual, axis=1)
-        keep = good[which] & (size < o.max_sigmas * sigma_px)
+        keep = good[which] & (size < MAX_SIGMAS * sigma_px)
         errors.append(size[keep])
         delta = 1e-6 * in_cam[:, 2:]
         jacobian = np.stack([(camera.project(in_cam + delta * a) - projected) / delta for a in pose[:3, :3].T], axis=2)
         # Huber's weights for the standard deviation of the previous iteration.
-        weights = np.where(keep, np.minimum(1.0, o.huber_sigmas * sigma_px / np.maximum(size, 1e-12)), 0.0)
+        weights = np.where(keep, np.minimum(1.0, HUBER_SIGMAS * sigma_px / np.maximum(size, 1e-12)), 0.0)
         weighted = np.nan_to_num(jacobian * weights[:, None, None])
         np.add.at(normal, which, np.einsum("nij,nik->njk", weighted, np.nan_to_num(jacobian)))
         np.add.at(right, which, np.einsum("nij,ni->nj", weighted, np.nan_to_num(residual)))

@@ -16,24 +16,15 @@ import numpy as np
 from arview.geometry import Array, apply, invert, orthonormalise, rigid, rotation_angle_rad
 from arview.reconstruction.scale.similarity import Similarity
 
-
-@dataclass(frozen=True)
-class VoteOptions:
-    """When detections agree, and when two similarities are the same.
-
-    Attributes:
-        agree_rad: largest difference in rotation of detections that agree.
-        across, along: largest differences of the centre, across and along the view, in diameters of the part.
-        same_rad, same_place, same_scale: differences in rotation, position (diameters) and log scale below which two
-            similarities count as one.
-    """
-
-    agree_rad: float = float(np.deg2rad(2.5))
-    across: float = 0.02
-    along: float = 0.06
-    same_rad: float = float(np.deg2rad(8.0))
-    same_place: float = 0.1
-    same_scale: float = 0.06
+AGREE_RAD = float(np.deg2rad(2.5))
+"""Largest difference in rotation of detections that agree."""
+ACROSS = 0.02
+ALONG = 0.06
+"""Largest differences of the centre, across and along the view, in diameters of the part."""
+SAME_RAD = float(np.deg2rad(8.0))
+SAME_PLACE = 0.1
+SAME_SCALE = 0.06
+"""Differences in rotation, position (diameters) and log scale below which two similarities count as one."""
 
 
 @dataclass(frozen=True)
@@ -62,26 +53,22 @@ class Vote:
     score: float
 
 
-def vote(
-    sightings: Sequence[Sighting], center_in_model: Array, diameter_mm: float, options: VoteOptions | None = None
-) -> list[Vote]:
+def vote(sightings: Sequence[Sighting], center_in_model: Array, diameter_mm: float) -> list[Vote]:
     """Similarities on which at least two photos agree, best first, each different from those before it.
 
     Args:
         sightings: detections; a photo may have several.
         center_in_model: (3,) centre of the part, mm.
         diameter_mm: of the part.
-        options: see `VoteOptions`.
     """
-    o = options or VoteOptions()
     votes = []
     for a, b in combinations(sightings, 2):
-        if a.photo == b.photo or rotation_angle_rad(_rotation(a), _rotation(b)) > o.agree_rad:
+        if a.photo == b.photo or rotation_angle_rad(_rotation(a), _rotation(b)) > AGREE_RAD:
             continue
         chosen: Sequence[Sighting] = (a, b)
         for _ in range(2):
             similarity = _fit(chosen, center_in_model)
-            chosen = _supporting(similarity, sightings, center_in_model, diameter_mm, o) if similarity else ()
+            chosen = _supporting(similarity, sightings, center_in_model, diameter_mm) if similarity else ()
             if len(chosen) < 2:
                 break
         if similarity is not None and len(chosen) >= 2:
@@ -89,7 +76,7 @@ def vote(
     votes.sort(key=lambda v: -v.score)
     apart: list[Vote] = []
     for candidate in votes:
-        if not any(_same(candidate.similarity, v.similarity, center_in_model, diameter_mm, o) for v in apart):
+        if not any(_same(candidate.similarity, v.similarity, center_in_model, diameter_mm) for v in apart):
             apart.append(candidate)
     return apart
 
@@ -116,36 +103,34 @@ def _fit(sightings: Sequence[Sighting], center_in_model: Array) -> Similarity | 
 
 
 def _supporting(
-    similarity: Similarity, sightings: Sequence[Sighting], center_in_model: Array, diameter_mm: float, o: VoteOptions
+    similarity: Similarity, sightings: Sequence[Sighting], center_in_model: Array, diameter_mm: float
 ) -> list[Sighting]:
     """The best detection of each photo that agrees with a similarity."""
     best: dict[int, Sighting] = {}
     for sighting in sightings:
-        if _agrees(similarity, sighting, center_in_model, diameter_mm, o):
+        if _agrees(similarity, sighting, center_in_model, diameter_mm):
             rival = best.get(sighting.photo)
             if rival is None or sighting.quality > rival.quality:
                 best[sighting.photo] = sighting
     return list(best.values())
 
 
-def _agrees(
-    similarity: Similarity, sighting: Sighting, center_in_model: Array, diameter_mm: float, o: VoteOptions
-) -> bool:
+def _agrees(similarity: Similarity, sighting: Sighting, center_in_model: Array, diameter_mm: float) -> bool:
     """Whether a detection agrees with a similarity."""
     expected = similarity.cam_from_model(sighting.cam_from_scan)
-    if rotation_angle_rad(expected, sighting.cam_from_model) > o.agree_rad:
+    if rotation_angle_rad(expected, sighting.cam_from_model) > AGREE_RAD:
         return False
     middle = apply(sighting.cam_from_model, center_in_model)
     away = apply(expected, center_in_model) - middle
     along = away @ middle / np.linalg.norm(middle)
     across = float(np.sqrt(max(0.0, away @ away - along**2)))
-    return bool(across < o.across * diameter_mm and abs(along) < o.along * diameter_mm)
+    return bool(across < ACROSS * diameter_mm and abs(along) < ALONG * diameter_mm)
 
 
-def _same(a: Similarity, b: Similarity, center_in_model: Array, diameter_mm: float, o: VoteOptions) -> bool:
+def _same(a: Similarity, b: Similarity, center_in_model: Array, diameter_mm: float) -> bool:
     """Whether two similarities are equal for practical purposes."""
-    if rotation_angle_rad(a.model_from_scan, b.model_from_scan) > o.same_rad:
+    if rotation_angle_rad(a.model_from_scan, b.model_from_scan) > SAME_RAD:
         return False
     middles = [apply(invert(s.model_from_scan), center_in_model) / s.scale for s in (a, b)]
-    is_near = np.linalg.norm(middles[0] - middles[1]) * a.scale < o.same_place * diameter_mm
-    return bool(is_near and abs(np.log(a.scale / b.scale)) < o.same_scale)
+    is_near = np.linalg.norm(middles[0] - middles[1]) * a.scale < SAME_PLACE * diameter_mm
+    return bool(is_near and abs(np.log(a.scale / b.scale)) < SAME_SCALE)

@@ -55,7 +55,7 @@ def smoothed(gray: NDArray[np.uint8]) -> NDArray[np.uint8]:
 @kernel
 def measure_edges(
     gray: NDArray[np.uint8], lines: ProjectedLines, reach: int, step_px: float, threshold: float
-) -> EdgeProfiles:  # fmt: skip
+) -> EdgeProfiles:
     """Grey-level steps along the normal of each point, see `EdgeProfiles`.
 
     Args:
@@ -130,9 +130,12 @@ def measure_edges(
 
 @kernel(fastmath=True)
 def weigh_by_color(
-    image: NDArray[np.uint8], colors: ColorModel, lines: ProjectedLines, kinds: NDArray[np.uint8],
-    profiles: EdgeProfiles
-) -> None:  # fmt: skip
+    image: NDArray[np.uint8],
+    colors: ColorModel,
+    lines: ProjectedLines,
+    kinds: NDArray[np.uint8],
+    profiles: EdgeProfiles,
+) -> None:
     """Weaken steps of the outline that do not separate colours of the part from colours of the background, in place.
 
     Highlights, shading close to a round rim and edges in the background are often stronger steps than the outline. Of
@@ -180,11 +183,19 @@ def weigh_by_color(
 
 @kernel
 def add_edges(
-    hessian: NDArray[np.float64], gradient: NDArray[np.float64], points: NDArray[np.float32],
-    kinds: NDArray[np.uint8], cam_from_body: NDArray[np.float64], intrinsics: NDArray[np.float64],
-    lines: ProjectedLines, profiles: EdgeProfiles, strength_half: float, sigma_px: float, spread_px: float,
-    weight: float
-) -> None:  # fmt: skip
+    hessian: NDArray[np.float64],
+    gradient: NDArray[np.float64],
+    points: NDArray[np.float32],
+    kinds: NDArray[np.uint8],
+    cam_from_body: NDArray[np.float64],
+    intrinsics: NDArray[np.float64],
+    lines: ProjectedLines,
+    profiles: EdgeProfiles,
+    strength_half: float,
+    sigma_px: float,
+    spread_px: float,
+    weight: float,
+) -> None:
     """Add the best hypothesis of each point to the 6×6 system.
 
     Args:

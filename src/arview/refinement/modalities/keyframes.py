@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arview.core.kernel import kernel
-from arview.errors import InputError
 from arview.geometry import Array, invert
 from arview.refinement.modalities.patch_alignment import Pyramid
 from arview.refinement.projection import project
@@ -24,65 +23,25 @@ _RESPONSE = (8.0 / (4 * 255)) ** 2
 """Response of cornerMinEigenVal (3×3 Sobel, uint8) to a mean squared gradient of one (grey level/px)²."""
 
 
-@dataclass(frozen=True)
-class TextureOptions:
-    """Options of the texture modality.
-
-    Attributes:
-        levels: levels of the image pyramid. The common shift is searched for at the coarsest, where 4 px are 32 px of
-            the picture.
-        search_px: largest common shift, px of the coarsest level; 0 leaves this search out.
-        max_corners: corners kept in a keyframe.
-        min_corners: corners needed for a keyframe.
-        corner_distance_px: smallest distance between two corners.
-        corner_contrast: weakest corner: rms gradient along the weaker direction, grey levels per px of the half-size
-            picture.
-        margin_px: the surface must continue this far around a corner, so that patches hold no background.
-        flatness_px: largest height of these surroundings over the tangent plane, px of the keyframe.
-        min_facing: smallest cosine between surface normal and line of sight; foreshortened patches match badly.
-        check_occlusion: test by a ray from each point to the camera whether the part hides it.
-        min_ncc: smallest normalised correlation of an aligned patch with its keyframe.
-        neighbour_px: largest deviation from the median displacement of the nearest neighbours.
-        view_step_rad: difference in direction of view that asks for a new keyframe.
-        roll_step_rad: difference in roll that asks for a new keyframe.
-        scale_step: relative difference in distance that asks for a new keyframe.
-        max_keyframes: keyframes kept; the least recently used is dropped beyond.
-        replace_distance: a keyframe nearer than this to a new one, in the steps above, is replaced by it.
-        min_trust: trust below which a corner is no longer used.
-        trust_rate: share by which a corner's trust follows each frame.
-        trusted_px: distance from where the pose places it within which a found corner gains trust.
-    """
-
-    levels: int = 4
-    search_px: int = 4
-    max_corners: int = 120
-    min_corners: int = 12
-    corner_distance_px: float = 7.0
-    corner_contrast: float = 3.0
-    margin_px: float = 6.0
-    flatness_px: float = 1.5
-    min_facing: float = 0.2
-    check_occlusion: bool = True
-    min_ncc: float = 0.8
-    neighbour_px: float = 3.0
-    view_step_rad: float = 0.17
-    roll_step_rad: float = 0.26
-    scale_step: float = 0.15
-    max_keyframes: int = 12
-    replace_distance: float = 0.3
-    min_trust: float = 0.2
-    trust_rate: float = 0.1
-    trusted_px: float = 2.0
-
-    def __post_init__(self) -> None:
-        if not 2 <= self.levels <= 6:
-            raise InputError(f"texture options: levels is {self.levels}, expected 2 to 6")
-        if not 0 < self.min_corners <= self.max_corners:
-            raise InputError(
-                f"texture options: min_corners {self.min_corners} is not in 1..max_corners {self.max_corners}"
-            )
-        if not 0.0 < self.min_ncc < 1.0:
-            raise InputError(f"texture options: min_ncc is {self.min_ncc}, expected within 0 to 1")
+LEVELS = 4
+"""Levels of the image pyramid. The common shift is searched for at the coarsest, where 4 px are 32 px of the
+picture."""
+MAX_CORNERS = 120
+"""Corners kept in a keyframe."""
+MIN_CORNERS = 12
+"""Corners needed for a keyframe."""
+CORNER_DISTANCE_PX = 7.0
+"""Smallest distance between two corners."""
+CORNER_CONTRAST = 3.0
+"""Weakest corner: rms gradient along the weaker direction, grey levels per px of the half-size picture."""
+MARGIN_PX = 6.0
+"""The surface must continue this far around a corner, so that patches hold no background."""
+FLATNESS_PX = 1.5
+"""Largest height of these surroundings over the tangent plane, px of the keyframe."""
+MIN_FACING = 0.2
+"""Smallest cosine between surface normal and line of sight; foreshortened patches match badly."""
+MIN_NCC = 0.8
+"""Smallest normalised correlation of an aligned patch with its keyframe."""
 
 
 class Anchors(NamedTuple):
@@ -132,9 +91,12 @@ def to_camera(m: Any, x: Any, y: Any, z: Any) -> Any:
 
 @kernel
 def tangent_jacobian(
-    point: NDArray[np.float64], tangents: NDArray[np.float64], cam_from_body: NDArray[np.float64],
-    intrinsics: NDArray[np.float64], out: NDArray[np.float64]
-) -> tuple[float, float, float]:  # fmt: skip
+    point: NDArray[np.float64],
+    tangents: NDArray[np.float64],
+    cam_from_body: NDArray[np.float64],
+    intrinsics: NDArray[np.float64],
+    out: NDArray[np.float64],
+) -> tuple[float, float, float]:
     """Pixel u, v and depth of a point; depth -1 behind the camera.
 
     Fills ``out`` (2,2) with px per mm along the two tangents, by central differences over about 4 px.
@@ -238,7 +200,9 @@ def _place_corners(
             dx = r[0, 0] * rx + r[0, 1] * ry + r[0, 2]
             dy = r[1, 0] * rx + r[1, 1] * ry + r[1, 2]
             dz = r[2, 0] * rx + r[2, 1] * ry + r[2, 2]
-            depth, face = cast_ray(hierarchy, r[0, 3], r[1, 3], r[2, 3], dx, dy, dz, 1e30, False)
+            depth, face = cast_ray(
+                hierarchy, r[0, 3], r[1, 3], oz=r[2, 3], dx=dx, dy=dy, dz=dz, limit=1e30, any_hit=False
+            )
             if face < 0:
                 whole = False
                 break
@@ -276,9 +240,11 @@ def _place_corners(
 
 @kernel
 def _all_jacobians(
-    points: NDArray[np.float64], tangents: NDArray[np.float64], cam_from_body: NDArray[np.float64],
-    intrinsics: NDArray[np.float64]
-) -> NDArray[np.float64]:  # fmt: skip
+    points: NDArray[np.float64],
+    tangents: NDArray[np.float64],
+    cam_from_body: NDArray[np.float64],
+    intrinsics: NDArray[np.float64],
+) -> NDArray[np.float64]:
     """Jacobians (N,2,2) of all points, see `tangent_jacobian`."""
     jacobians = np.empty((points.shape[0], 2, 2))
     for i in range(points.shape[0]):
@@ -292,7 +258,6 @@ def make_keyframe(
     outline: Array,
     caster: RayCaster,
     intrinsics: Array,
-    options: TextureOptions,
 ) -> Keyframe | None:
     """Keyframe of a picture; None when too few corners lie on the part.
 
@@ -302,9 +267,7 @@ def make_keyframe(
         outline: (K,2) convex polygon around the part, px.
         caster: ray caster of the part in the body frame.
         intrinsics: (10,) as of `intrinsics_of`.
-        options: options of the modality.
     """
-    o = options
     rectangle = _rectangle(outline, pyramid)
     if rectangle is None:
         return None
@@ -315,14 +278,21 @@ def make_keyframe(
     mask = np.zeros(response.shape, dtype=np.uint8)
     cv2.fillConvexPoly(mask, np.round((outline - (left, top)) / 2.0).astype(np.int32), 1)
     response *= mask
-    cell = max(2, round(0.5 * o.corner_distance_px))
-    corners = _best_corners(response, _RESPONSE * o.corner_contrast**2, cell)
+    cell = max(2, round(0.5 * CORNER_DISTANCE_PX))
+    corners = _best_corners(response, _RESPONSE * CORNER_CONTRAST**2, cell)
     corners = 2.0 * corners[np.argsort(-corners[:, 2]), :2] + (left, top)
     used, kept, points, tangents = _place_corners(
-        caster.hierarchy, invert(cam_from_body), corners, intrinsics, o.margin_px, o.corner_distance_px,
-        o.flatness_px, o.min_facing, o.max_corners,
-    )  # fmt: skip
-    if used < o.min_corners:
+        caster.hierarchy,
+        invert(cam_from_body),
+        corners,
+        intrinsics,
+        MARGIN_PX,
+        CORNER_DISTANCE_PX,
+        FLATNESS_PX,
+        MIN_FACING,
+        MAX_CORNERS,
+    )
+    if used < MIN_CORNERS:
         return None
     points, tangents = points[:used].copy(), tangents[:used].copy()
     return Keyframe(

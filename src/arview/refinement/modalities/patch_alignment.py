@@ -27,7 +27,7 @@ def build_pyramid(gray: NDArray[np.uint8], levels: int) -> Pyramid:
 @kernel(fastmath=True)
 def sample_patch(
     image: NDArray[np.uint8], u: float, v: float, warp: NDArray[np.float64], half: int, out: NDArray[np.float32]
-) -> bool:  # fmt: skip
+) -> bool:
     """Fill ``out`` (2·half+1)² with the image at (u, v) + warp · offset; False when the patch leaves the image."""
     height, width = image.shape
     reach_u = half * (abs(warp[0, 0]) + abs(warp[0, 1]))
@@ -51,9 +51,12 @@ def sample_patch(
 
 @kernel(fastmath=True)
 def prepare_template(
-    patch: NDArray[np.float32], side: int, template: NDArray[np.float32], across: NDArray[np.float32],
-    down: NDArray[np.float32]
-) -> tuple[tuple[Scalar, Scalar, Scalar], Scalar]:  # fmt: skip
+    patch: NDArray[np.float32],
+    side: int,
+    template: NDArray[np.float32],
+    across: NDArray[np.float32],
+    down: NDArray[np.float32],
+) -> tuple[tuple[Scalar, Scalar, Scalar], Scalar]:
     """Fill ``template`` with zero mean and unit norm, and its gradients orthogonal to it and to a constant.
 
     Args:
@@ -110,10 +113,18 @@ def prepare_template(
 
 @kernel(fastmath=True)
 def align_template(
-    image: NDArray[np.uint8], u: Scalar, v: Scalar, side: int, template: NDArray[np.float32],
-    across: NDArray[np.float32], down: NDArray[np.float32], normal: tuple[Scalar, Scalar, Scalar], norm: Scalar,
-    steps: int, stop_px: float
-) -> tuple[Scalar, Scalar, Scalar]:  # fmt: skip
+    image: NDArray[np.uint8],
+    u: Scalar,
+    v: Scalar,
+    side: int,
+    template: NDArray[np.float32],
+    across: NDArray[np.float32],
+    down: NDArray[np.float32],
+    normal: tuple[Scalar, Scalar, Scalar],
+    norm: Scalar,
+    steps: int,
+    stop_px: float,
+) -> tuple[Scalar, Scalar, Scalar]:
     """Align a prepared template with the image, starting at (u, v).
 
     The gradients are orthogonal to the template and to a constant, so that gain and offset do not enter the residual;
@@ -179,9 +190,15 @@ def align_template(
 
 @kernel(fastmath=True)
 def common_shift(
-    key_image: NDArray[np.uint8], image: NDArray[np.uint8], scale: int, key_pixels: NDArray[np.float64],
-    pixels: NDArray[np.float64], warps: NDArray[np.float64], chosen: NDArray[np.int64], reach: int
-) -> tuple[float, float]:  # fmt: skip
+    key_image: NDArray[np.uint8],
+    image: NDArray[np.uint8],
+    scale: int,
+    key_pixels: NDArray[np.float64],
+    pixels: NDArray[np.float64],
+    warps: NDArray[np.float64],
+    chosen: NDArray[np.int64],
+    reach: int,
+) -> tuple[float, float]:
     """Shift (du, dv), px of the finest level, that aligns the chosen patches best with a coarse image.
 
     The search is exhaustive over ±``reach`` px of the coarse level and refined by parabolas. A shift is scored by the

@@ -74,9 +74,16 @@ def value_bins(gain: float) -> NDArray[np.int64]:
 
 @kernel
 def add_histograms(
-    image: NDArray[np.uint8], bin_of: NDArray[np.int64], lines: ProjectedLines, runs_mm: NDArray[np.float32],
-    focal: float, fore: NDArray[np.float64], back: NDArray[np.float64], reach_px: float, gap_px: float
-) -> None:  # fmt: skip
+    image: NDArray[np.uint8],
+    bin_of: NDArray[np.int64],
+    lines: ProjectedLines,
+    runs_mm: NDArray[np.float32],
+    focal: float,
+    fore: NDArray[np.float64],
+    back: NDArray[np.float64],
+    reach_px: float,
+    gap_px: float,
+) -> None:
     """Count the colours inside and outside the contour into ``fore`` and ``back`` (BINS³,).
 
     Args:
@@ -125,9 +132,13 @@ def log_odds(fore: NDArray[np.float64], back: NDArray[np.float64], out: NDArray[
 
 @kernel(fastmath=True)
 def measure_region(
-    image: NDArray[np.uint8], colors: ColorModel, lines: ProjectedLines, runs_mm: NDArray[np.float32], focal: float,
-    scale: int
-) -> RegionLines:  # fmt: skip
+    image: NDArray[np.uint8],
+    colors: ColorModel,
+    lines: ProjectedLines,
+    runs_mm: NDArray[np.float32],
+    focal: float,
+    scale: int,
+) -> RegionLines:
     """Displacement of the contour along each line, see `RegionLines`.
 
     Args:
@@ -217,10 +228,16 @@ def _moments(posterior: NDArray[np.float64], norm: float) -> tuple[float, float]
 
 @kernel
 def add_region(
-    hessian: NDArray[np.float64], gradient: NDArray[np.float64], points: NDArray[np.float32],
-    cam_from_body: NDArray[np.float64], intrinsics: NDArray[np.float64], lines: ProjectedLines, region: RegionLines,
-    weight: float, robust_px: float
-) -> tuple[float, float]:  # fmt: skip
+    hessian: NDArray[np.float64],
+    gradient: NDArray[np.float64],
+    points: NDArray[np.float32],
+    cam_from_body: NDArray[np.float64],
+    intrinsics: NDArray[np.float64],
+    lines: ProjectedLines,
+    region: RegionLines,
+    weight: float,
+    robust_px: float,
+) -> tuple[float, float]:
     """Add the Gaussians of the lines to the 6×6 system.
 
     Args:

@@ -52,22 +52,22 @@ CREASE_DEG = 40.0
 """Faces that meet at a larger angle have an edge between them."""
 
 
+RADIUS_PX = 26.0
+"""Half diameter of the part in the reduced picture; smaller parts are not enlarged."""
+REACH = 1.15
+"""Half size of the crop, in half diameters of the part."""
+
+
 @dataclass(frozen=True)
 class ShadingOptions:
     """Options of the shading modality.
 
     Attributes:
         gain: weight of the shading relative to edges and colours, by the residual variance of the brightness.
-        radius_px: half diameter of the part in the reduced picture; smaller parts are not enlarged.
-        reach: half size of the crop, in half diameters of the part.
-        min_curved_share: share of curved surface needed, because any light can explain the brightness of flat faces.
         rounds: updates of the pose.
     """
 
     gain: float = 5.0
-    radius_px: float = 26.0
-    reach: float = 1.15
-    min_curved_share: float = 0.2
     rounds: int = 4
 
 
@@ -156,7 +156,7 @@ def corner_normals(surface: Surface) -> NDArray[np.float32]:
 
 
 def crop_for_shading(
-    gray: NDArray[np.uint8], camera: Camera, diameter_mm: float, cam_from_body: Array, options: ShadingOptions
+    gray: NDArray[np.uint8], camera: Camera, diameter_mm: float, cam_from_body: Array
 ) -> ShadingCrop | None:
     """Reduced picture around the part for `refine_by_shading`; None where the part is not in the picture.
 
@@ -165,7 +165,6 @@ def crop_for_shading(
         camera: camera of the picture. Its distortion moves the part as a whole; within the part it is neglected.
         diameter_mm: diameter of the part.
         cam_from_body: (4,4) rough pose.
-        options: see `ShadingOptions`.
     """
     place = cam_from_body[:3, 3]
     center = camera.project(place)
@@ -173,9 +172,9 @@ def crop_for_shading(
         return None
     radius_px = 0.5 * diameter_mm * camera.fx / float(np.linalg.norm(place))
     limits = np.array([camera.width, camera.height])
-    first = np.clip(np.floor(center - options.reach * radius_px), 0, limits).astype(int)
-    last = np.clip(np.ceil(center + options.reach * radius_px), 0, limits).astype(int)
-    scale = min(1.0, options.radius_px / radius_px)
+    first = np.clip(np.floor(center - REACH * radius_px), 0, limits).astype(int)
+    last = np.clip(np.ceil(center + REACH * radius_px), 0, limits).astype(int)
+    scale = min(1.0, RADIUS_PX / radius_px)
     size = np.round(scale * (last - first)).astype(int)
     if np.any(size < 2 * RIM_PX + 4):
         return None
@@ -188,9 +187,15 @@ def crop_for_shading(
 
 @kernel
 def refine_by_shading(
-    crop: ShadingCrop, surface: Surface, corners: NDArray[np.float32], diameter_mm: float,
-    cam_from_body: NDArray[np.float64], information: NDArray[np.float64], gain: float, rounds: int
-) -> ShadedPose:  # fmt: skip
+    crop: ShadingCrop,
+    surface: Surface,
+    corners: NDArray[np.float32],
+    diameter_mm: float,
+    cam_from_body: NDArray[np.float64],
+    information: NDArray[np.float64],
+    gain: float,
+    rounds: int,
+) -> ShadedPose:
     """Refine a pose by the shading of the part's surface, see `ShadedPose`.
 
     Args:
@@ -221,7 +226,16 @@ def refine_by_shading(
         for k in range(2):
             center_px[k] = middle_px[k] + focal_px[k] * pose[k, 3] / pose[2, 3]
         draw_surface(surface, pose, focal_px, center_px, diameter_mm, drawn, face_ids)
-        _smooth_normals(drawn, face_ids, surface, corners, pose, focal_px, middle_px, diameter_mm)
+        _smooth_normals(
+            drawn,
+            face_ids,
+            surface,
+            corners=corners,
+            pose=pose,
+            focal_px=focal_px,
+            middle_px=middle_px,
+            diameter_mm=diameter_mm,
+        )
         places = _inner_pixels(drawn, face_ids)
         if len(places) < MIN_PIXELS:
             return ShadedPose(cam_from_body.copy(), information.copy(), -1.0)
@@ -232,7 +246,16 @@ def refine_by_shading(
             values[i] = bright[v, u]
             _harmonics(drawn[0, v, u], drawn[1, v, u], drawn[2, v, u], functions[i])
         light, weights = _fit_light(values, functions, light, explained >= 0.0)
-        motion = _jacobian(places, light, drawn, face_ids, pose, focal_px, middle_px, diameter_mm)
+        motion = _jacobian(
+            places,
+            light,
+            drawn,
+            face_ids=face_ids,
+            pose=pose,
+            focal_px=focal_px,
+            middle_px=middle_px,
+            diameter_mm=diameter_mm,
+        )
         hessian, gradient, explained = _reduce_system(motion, functions, values, weights, light)
         best = information + gain * hessian
         if not _is_determined(best):
@@ -257,9 +280,15 @@ def _is_determined(information: NDArray[np.float64]) -> bool:
 
 @kernel
 def _smooth_normals(
-    drawn: NDArray[np.float32], face_ids: NDArray[np.int32], surface: Surface, corners: NDArray[np.float32],
-    pose: NDArray[np.float64], focal_px: NDArray[np.float64], middle_px: NDArray[np.float64], diameter_mm: float
-) -> None:  # fmt: skip
+    drawn: NDArray[np.float32],
+    face_ids: NDArray[np.int32],
+    surface: Surface,
+    corners: NDArray[np.float32],
+    pose: NDArray[np.float64],
+    focal_px: NDArray[np.float64],
+    middle_px: NDArray[np.float64],
+    diameter_mm: float,
+) -> None:
     """Replace the normals of the faces by interpolated normals of their corners (Phong, CACM 1975), in place."""
     points, faces = surface[0], surface[1]
     place, normal = np.empty(3), np.empty(3)
@@ -335,7 +364,7 @@ def _harmonics(x: float | np.float32, y: float | np.float32, z: float | np.float
 @kernel
 def _fit_light(
     values: NDArray[np.float64], functions: NDArray[np.float64], light: NDArray[np.float64], is_known: bool
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:  # fmt: skip
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Light (9,) that explains grey levels (N,) best, and their robust weights (N,) (Geman & McClure).
 
     Args:
@@ -367,9 +396,15 @@ def _weigh(residuals: NDArray[np.float64], weights: NDArray[np.float64]) -> None
 
 @kernel
 def _jacobian(
-    places: NDArray[np.int64], light: NDArray[np.float64], drawn: NDArray[np.float32], face_ids: NDArray[np.int32],
-    pose: NDArray[np.float64], focal_px: NDArray[np.float64], middle_px: NDArray[np.float64], diameter_mm: float
-) -> NDArray[np.float64]:  # fmt: skip
+    places: NDArray[np.int64],
+    light: NDArray[np.float64],
+    drawn: NDArray[np.float32],
+    face_ids: NDArray[np.int32],
+    pose: NDArray[np.float64],
+    focal_px: NDArray[np.float64],
+    middle_px: NDArray[np.float64],
+    diameter_mm: float,
+) -> NDArray[np.float64]:
     """Derivative (N,6) of the brightness at each pixel with respect to the twist, see `gauss_newton`.
 
     A moved surface shows another of its points at a pixel, and the normal of that point is turned.
@@ -415,9 +450,12 @@ def _jacobian(
 
 @kernel
 def _reduce_system(
-    motion: NDArray[np.float64], functions: NDArray[np.float64], values: NDArray[np.float64],
-    weights: NDArray[np.float64], light: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:  # fmt: skip
+    motion: NDArray[np.float64],
+    functions: NDArray[np.float64],
+    values: NDArray[np.float64],
+    weights: NDArray[np.float64],
+    light: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
     """System (6,6), (6,) of the pose with the light eliminated, and the share of the variance that is explained.
 
     The system is divided by the residual variance of the brightness.

@@ -18,11 +18,7 @@ from numpy.typing import NDArray
 from arview.camera import Camera
 from arview.errors import InputError
 from arview.geometry import Array
-from arview.refinement.modalities.keyframes import (
-    Keyframe,
-    TextureOptions,
-    make_keyframe,
-)
+from arview.refinement.modalities.keyframes import LEVELS, MIN_CORNERS, MIN_FACING, MIN_NCC, Keyframe, make_keyframe
 from arview.refinement.modalities.patch_alignment import (
     Pyramid,
     build_pyramid,
@@ -30,6 +26,29 @@ from arview.refinement.modalities.patch_alignment import (
 from arview.refinement.modalities.texture_matching import MatchSettings, align_pose, match_texture
 from arview.refinement.projection import intrinsics_of
 from arview.rendering.raycast import RayCaster
+
+SEARCH_PX = 4
+"""Largest common shift, px of the coarsest level; 0 leaves this search out."""
+CHECK_OCCLUSION = True
+"""Test by a ray from each point to the camera whether the part hides it."""
+NEIGHBOUR_PX = 3.0
+"""Largest deviation from the median displacement of the nearest neighbours."""
+VIEW_STEP_RAD = 0.17
+"""Difference in direction of view that asks for a new keyframe."""
+ROLL_STEP_RAD = 0.26
+"""Difference in roll that asks for a new keyframe."""
+SCALE_STEP = 0.15
+"""Relative difference in distance that asks for a new keyframe."""
+MAX_KEYFRAMES = 12
+"""Keyframes kept; the least recently used is dropped beyond."""
+REPLACE_DISTANCE = 0.3
+"""A keyframe nearer than this to a new one, in the steps above, is replaced by it."""
+MIN_TRUST = 0.2
+"""Trust below which a corner is no longer used."""
+TRUST_RATE = 0.1
+"""Share by which a corner's trust follows each frame."""
+TRUSTED_PX = 2.0
+"""Distance from where the pose places it within which a found corner gains trust."""
 
 
 class TextureMatches(NamedTuple):
@@ -55,7 +74,6 @@ class TextureModality:
         vertices_in_body: (V,3) mm, vertices of the part about its centre.
         faces: (F,3) triangles of the part.
         camera: intrinsics of the frames.
-        options: see `TextureOptions`.
     """
 
     def __init__(
@@ -63,9 +81,7 @@ class TextureModality:
         vertices_in_body: Array,
         faces: NDArray[np.int32],
         camera: Camera,
-        options: TextureOptions | None = None,
     ) -> None:
-        self.options = options or TextureOptions()
         self.camera = camera
         self.keyframes: list[Keyframe] = []
         self._caster = RayCaster(vertices_in_body, faces)
@@ -90,7 +106,7 @@ class TextureModality:
                 f"texture modality: image is {gray.shape[1]}×{gray.shape[0]}, "
                 f"the camera {self.camera.width}×{self.camera.height}"
             )
-        return build_pyramid(gray, self.options.levels)
+        return build_pyramid(gray, LEVELS)
 
     def clear(self) -> None:
         """Forget all keyframes."""
@@ -101,7 +117,6 @@ class TextureModality:
         """Keyframe nearest in direction of view, roll and distance, and its distance in the steps of the options."""
         if not self.keyframes:
             return None, np.inf
-        o = self.options
         poses = np.stack([keyframe.cam_from_body for keyframe in self.keyframes])
         eyes = np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
         eye = cam_from_body[:3, 3] @ cam_from_body[:3, :3]
@@ -109,8 +124,8 @@ class TextureModality:
         view = np.arccos(np.clip(eyes @ eye / (ranges * distance), -1.0, 1.0))
         turn = np.einsum("ik,njk->nij", cam_from_body[:3, :3], poses[:, :3, :3])
         roll = np.abs(np.arctan2(turn[:, 1, 0] - turn[:, 0, 1], turn[:, 0, 0] + turn[:, 1, 1]))
-        scale = np.abs(np.log(distance / ranges)) / np.log1p(o.scale_step)
-        steps = np.maximum(np.maximum(view / o.view_step_rad, roll / o.roll_step_rad), scale)
+        scale = np.abs(np.log(distance / ranges)) / np.log1p(SCALE_STEP)
+        steps = np.maximum(np.maximum(view / VIEW_STEP_RAD, roll / ROLL_STEP_RAD), scale)
         best = int(np.argmin(steps))
         return self.keyframes[best], float(steps[best])
 
@@ -122,7 +137,7 @@ class TextureModality:
         keyframe, distance = self._nearest(cam_from_body)
         if keyframe is None or distance > 1.0:
             return True
-        return tracked_count < self.options.min_corners and distance > self.options.replace_distance
+        return tracked_count < MIN_CORNERS and distance > REPLACE_DISTANCE
 
     def add_keyframe(self, gray: NDArray[np.uint8] | Pyramid, cam_from_body: Array) -> int:
         """Make a keyframe of a frame whose pose is reliable.
@@ -135,17 +150,15 @@ class TextureModality:
             Number of corners; 0 when they are too few and no keyframe was made.
         """
         pyramid = gray if isinstance(gray, tuple) else self.pyramid(gray)
-        keyframe = make_keyframe(
-            pyramid, cam_from_body, self._outline(cam_from_body), self._caster, self._intrinsics, self.options
-        )
+        keyframe = make_keyframe(pyramid, cam_from_body, self._outline(cam_from_body), self._caster, self._intrinsics)
         if keyframe is None:
             return 0
         self._clock += 1
         keyframe.last_used = self._clock
         nearest, distance = self._nearest(cam_from_body)
-        if nearest is not None and distance < self.options.replace_distance:
+        if nearest is not None and distance < REPLACE_DISTANCE:
             self.keyframes.remove(nearest)
-        elif len(self.keyframes) >= self.options.max_keyframes:
+        elif len(self.keyframes) >= MAX_KEYFRAMES:
             self.keyframes.remove(min(self.keyframes, key=lambda old: old.last_used))
         self.keyframes.append(keyframe)
         return len(keyframe.anchors.points)
@@ -165,7 +178,6 @@ class TextureModality:
             pyramid: image pyramid of the frame, see `pyramid`.
             cam_from_body: (4,4) predicted pose, off by at most about 30 px in a picture of 640×480.
         """
-        o = self.options
         keyframe, _ = self._nearest(cam_from_body)
         if keyframe is None:
             self._last = None
@@ -173,17 +185,23 @@ class TextureModality:
         self._clock += 1
         keyframe.last_used = self._clock
         settings = MatchSettings(
-            search_px=o.search_px,
-            check_occlusion=o.check_occlusion,
-            min_facing=o.min_facing,
-            min_trust=o.min_trust,
-            min_ncc=o.min_ncc,
-            neighbour_px=o.neighbour_px,
+            search_px=SEARCH_PX,
+            check_occlusion=CHECK_OCCLUSION,
+            min_facing=MIN_FACING,
+            min_trust=MIN_TRUST,
+            min_ncc=MIN_NCC,
+            neighbour_px=NEIGHBOUR_PX,
         )
         matches = match_texture(
-            keyframe.pyramid, pyramid, keyframe.anchors, self._caster.hierarchy, cam_from_body, self._intrinsics,
-            self._damping, settings,
-        )  # fmt: skip
+            keyframe.pyramid,
+            pyramid,
+            keyframe.anchors,
+            self._caster.hierarchy,
+            cam_from_body,
+            self._intrinsics,
+            self._damping,
+            settings,
+        )
         found = np.flatnonzero(matches.weights > 0.0)
         self._last = (keyframe, found, matches.pixels[found])
         tried = int(np.count_nonzero(matches.expected))
@@ -204,18 +222,17 @@ class TextureModality:
         and is no longer used when little is left. One that was not found may be hidden and keeps its trust. A keyframe
         with too few trusted corners is dropped.
         """
-        o = self.options
         if self._last is None:
             return
         keyframe, found, pixels = self._last
         trust = keyframe.anchors.trust
         points = keyframe.anchors.points[found] @ cam_from_body[:3, :3].T + cam_from_body[:3, 3]
         with np.errstate(invalid="ignore"):
-            good = np.linalg.norm(self.camera.project(points) - pixels, axis=1) <= o.trusted_px
+            good = np.linalg.norm(self.camera.project(points) - pixels, axis=1) <= TRUSTED_PX
         # When most corners disagree, the pose may be wrong.
         if 2 * np.count_nonzero(good) < len(found):
             return
-        trust[found] += o.trust_rate * (good - trust[found])
-        if np.count_nonzero(trust >= o.min_trust) < o.min_corners and keyframe in self.keyframes:
+        trust[found] += TRUST_RATE * (good - trust[found])
+        if np.count_nonzero(trust >= MIN_TRUST) < MIN_CORNERS and keyframe in self.keyframes:
             self.keyframes.remove(keyframe)
         self._last = None

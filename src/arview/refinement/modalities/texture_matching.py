@@ -17,7 +17,7 @@ from arview.rendering.raycast import Hierarchy, cast_ray
 
 
 class MatchSettings(NamedTuple):
-    """Options of the matching in the form of the kernels, see `TextureOptions`."""
+    """Options of the matching in the form of the kernels."""
 
     search_px: int
     check_occlusion: bool
@@ -52,7 +52,7 @@ COARSE_NCC = 0.6
 @kernel
 def _agree_with_neighbours(
     predicted: NDArray[np.float64], pixels: NDArray[np.float64], weights: NDArray[np.float64], limit_px: float
-) -> None:  # fmt: skip
+) -> None:
     """Clear the weights of points whose displacement differs from the median of their nearest neighbours."""
     count = predicted.shape[0]
     near = NEIGHBOURS
@@ -94,10 +94,16 @@ def _agree_with_neighbours(
 
 @kernel
 def add_matches(
-    hessian: NDArray[np.float64], gradient: NDArray[np.float64], points: NDArray[np.float64],
-    cam_from_body: NDArray[np.float64], intrinsics: NDArray[np.float64], pixels: NDArray[np.float64],
-    weights: NDArray[np.float64], sigma_px: float, robust_px: float
-) -> tuple[float, float, int]:  # fmt: skip
+    hessian: NDArray[np.float64],
+    gradient: NDArray[np.float64],
+    points: NDArray[np.float64],
+    cam_from_body: NDArray[np.float64],
+    intrinsics: NDArray[np.float64],
+    pixels: NDArray[np.float64],
+    weights: NDArray[np.float64],
+    sigma_px: float,
+    robust_px: float,
+) -> tuple[float, float, int]:
     """Add the reprojection residuals of matched points to the 6×6 system.
 
     Args:
@@ -138,9 +144,14 @@ def add_matches(
 
 @kernel
 def align_pose(
-    points: NDArray[np.float64], cam_from_body: NDArray[np.float64], intrinsics: NDArray[np.float64],
-    pixels: NDArray[np.float64], weights: NDArray[np.float64], damping: NDArray[np.float64], sigma_px: float
-) -> NDArray[np.float64]:  # fmt: skip
+    points: NDArray[np.float64],
+    cam_from_body: NDArray[np.float64],
+    intrinsics: NDArray[np.float64],
+    pixels: NDArray[np.float64],
+    weights: NDArray[np.float64],
+    damping: NDArray[np.float64],
+    sigma_px: float,
+) -> NDArray[np.float64]:
     """Pose (4,4) that projects points on their pixels; the robust limit shrinks from 40 to 3 px."""
     hessian = np.zeros((6, 6))
     gradient = np.zeros(6)
@@ -148,7 +159,17 @@ def align_pose(
     for _ in range(8):
         hessian[:] = 0.0
         gradient[:] = 0.0
-        add_matches(hessian, gradient, points, cam_from_body, intrinsics, pixels, weights, sigma_px, robust_px)
+        add_matches(
+            hessian,
+            gradient,
+            points,
+            cam_from_body,
+            intrinsics,
+            pixels,
+            weights,
+            sigma_px=sigma_px,
+            robust_px=robust_px,
+        )
         cam_from_body = apply_twist(cam_from_body, solve_step(hessian, gradient, damping))
         robust_px = max(3.0, 0.6 * robust_px)
     return cam_from_body
@@ -156,9 +177,13 @@ def align_pose(
 
 @kernel
 def _count_near(
-    points: NDArray[np.float64], cam_from_body: NDArray[np.float64], intrinsics: NDArray[np.float64],
-    pixels: NDArray[np.float64], weights: NDArray[np.float64], limit_px: float
-) -> int:  # fmt: skip
+    points: NDArray[np.float64],
+    cam_from_body: NDArray[np.float64],
+    intrinsics: NDArray[np.float64],
+    pixels: NDArray[np.float64],
+    weights: NDArray[np.float64],
+    limit_px: float,
+) -> int:
     """Number of points of positive weight that project to within ``limit_px`` of their pixels."""
     count = 0
     for i in range(points.shape[0]):
@@ -173,7 +198,7 @@ def _count_near(
 @kernel
 def _find_visible(
     anchors: Anchors, hierarchy: Hierarchy, cam_from_body: NDArray[np.float64], settings: MatchSettings
-) -> NDArray[np.bool_]:  # fmt: skip
+) -> NDArray[np.bool_]:
     """Whether each trusted anchor (N,) faces the camera and is not hidden behind the part itself."""
     r = cam_from_body
     eye = np.empty(3)
@@ -196,16 +221,22 @@ def _find_visible(
         if settings.check_occlusion:
             # The ray starts 1 % along its way, so that it does not hit the surface itself.
             x, y, z = p[0] + 0.01 * dx, p[1] + 0.01 * dy, p[2] + 0.01 * dz
-            _, face = cast_ray(hierarchy, x, y, z, dx, dy, dz, 0.99, True)
+            _, face = cast_ray(hierarchy, x, y, z, dx, dy, dz, limit=0.99, any_hit=True)
         wanted[i] = face < 0
     return wanted
 
 
 @kernel
 def _predict(
-    anchors: Anchors, cam_from_body: NDArray[np.float64], intrinsics: NDArray[np.float64], width: int, height: int,
-    wanted: NDArray[np.bool_], predicted: NDArray[np.float64], warps: NDArray[np.float64]
-) -> None:  # fmt: skip
+    anchors: Anchors,
+    cam_from_body: NDArray[np.float64],
+    intrinsics: NDArray[np.float64],
+    width: int,
+    height: int,
+    wanted: NDArray[np.bool_],
+    predicted: NDArray[np.float64],
+    warps: NDArray[np.float64],
+) -> None:
     """Fill the predicted pixels (N,2) and the warps (N,2,2) of the tangent planes from frame to keyframe px.
 
     Clears ``wanted`` (N,) where the patch is outside the picture or much larger or smaller than in the keyframe.
@@ -235,10 +266,16 @@ def _predict(
 
 @kernel
 def _align_level(
-    level: int, key_pyramid: tuple[NDArray[np.uint8], ...], pyramid: tuple[NDArray[np.uint8], ...],
-    key_pixels: NDArray[np.float64], warps: NDArray[np.float64], wanted: NDArray[np.bool_], min_ncc: float,
-    pixels: NDArray[np.float64], scores: NDArray[np.float64]
-) -> None:  # fmt: skip
+    level: int,
+    key_pyramid: tuple[NDArray[np.uint8], ...],
+    pyramid: tuple[NDArray[np.uint8], ...],
+    key_pixels: NDArray[np.float64],
+    warps: NDArray[np.float64],
+    wanted: NDArray[np.bool_],
+    min_ncc: float,
+    pixels: NDArray[np.float64],
+    scores: NDArray[np.float64],
+) -> None:
     """Align the wanted patches on one level, starting at ``pixels`` (N,2) in place; fills scores (N,), 0 = failed."""
     side = PATCH_SIDE
     patch = np.empty((side + 2, side + 2), dtype=np.float32)
@@ -258,7 +295,9 @@ def _align_level(
         if norm == 0.0:
             continue
         u, v = pixels[i, 0] / scale, pixels[i, 1] / scale
-        u, v, ncc = align_template(image, u, v, side, template, across, down, normal, norm, 12, 0.03)
+        u, v, ncc = align_template(
+            image, u, v, side, template, across, down, normal=normal, norm=norm, steps=12, stop_px=0.03
+        )
         if ncc >= min_ncc:
             pixels[i, 0], pixels[i, 1] = u * scale, v * scale
             scores[i] = ncc
@@ -266,10 +305,15 @@ def _align_level(
 
 @kernel
 def match_texture(
-    key_pyramid: tuple[NDArray[np.uint8], ...], pyramid: tuple[NDArray[np.uint8], ...], anchors: Anchors,
-    hierarchy: Hierarchy, cam_from_body: NDArray[np.float64], intrinsics: NDArray[np.float64],
-    damping: NDArray[np.float64], settings: MatchSettings
-) -> PatchMatches:  # fmt: skip
+    key_pyramid: tuple[NDArray[np.uint8], ...],
+    pyramid: tuple[NDArray[np.uint8], ...],
+    anchors: Anchors,
+    hierarchy: Hierarchy,
+    cam_from_body: NDArray[np.float64],
+    intrinsics: NDArray[np.float64],
+    damping: NDArray[np.float64],
+    settings: MatchSettings,
+) -> PatchMatches:
     """Find the corners of a keyframe in a new frame, see `PatchMatches`.
 
     All patches are first shifted together on the coarsest level, then aligned one by one on level 2. If these agree on
@@ -292,28 +336,28 @@ def match_texture(
     warps = np.empty((count, 2, 2))
     scores = np.zeros(count)
     expected = _find_visible(anchors, hierarchy, cam_from_body, settings)
-    _predict(anchors, cam_from_body, intrinsics, width, height, expected, predicted, warps)
+    _predict(anchors, cam_from_body, intrinsics, width, height, expected, predicted, warps=warps)
     seen = np.flatnonzero(expected)
     pixels = predicted.copy()
     if settings.search_px > 0 and len(seen) > 0:
         chosen = seen[:: max(1, len(seen) // 24)]
         shift = common_shift(
-            key_pyramid[top], pyramid[top], 1 << top, anchors.pixels, predicted, warps, chosen, settings.search_px
+            key_pyramid[top], pyramid[top], 1 << top, anchors.pixels, predicted, warps, chosen, reach=settings.search_px
         )
         for a in range(2):
             pixels[:, a] += shift[a]
     if top > 1:
-        _align_level(2, key_pyramid, pyramid, anchors.pixels, warps, expected, COARSE_NCC, pixels, scores)
+        _align_level(2, key_pyramid, pyramid, anchors.pixels, warps, expected, COARSE_NCC, pixels=pixels, scores=scores)
         found = np.count_nonzero(scores)
         coarse = align_pose(points, cam_from_body, intrinsics, pixels, scores, damping, 1.0)
         near = _count_near(points, coarse, intrinsics, pixels, scores, 5.0)
         if near >= 8 and near > 0.6 * found:
-            _predict(anchors, coarse, intrinsics, width, height, expected, predicted, warps)
+            _predict(anchors, coarse, intrinsics, width, height, expected, predicted, warps=warps)
             pixels[:] = predicted
-    _align_level(1, key_pyramid, pyramid, anchors.pixels, warps, expected, min_ncc, pixels, scores)
+    _align_level(1, key_pyramid, pyramid, anchors.pixels, warps, expected, min_ncc, pixels=pixels, scores=scores)
     # A patch found only at half resolution, because of blur or noise, is half as accurate.
     weights = np.maximum(scores - min_ncc, 0.0) / (4.0 * (1.0 - min_ncc))
-    _align_level(0, key_pyramid, pyramid, anchors.pixels, warps, expected, min_ncc, pixels, scores)
+    _align_level(0, key_pyramid, pyramid, anchors.pixels, warps, expected, min_ncc, pixels=pixels, scores=scores)
     for i in range(count):
         if scores[i] > 0.0:
             weights[i] = (scores[i] - min_ncc) / (1.0 - min_ncc)

@@ -1,6 +1,5 @@
 """Identity: whether the specimen in view is the one that was followed, to which labels of a serial number belong."""
 
 from arview.tracking.identity.monitor import IdentityMonitor, IdentityResult
-from arview.tracking.identity.options import IdentityOptions
 
-__all__ = ["IdentityMonitor", "IdentityOptions", "IdentityResult"]
+__all__ = ["IdentityMonitor", "IdentityResult"]

@@ -22,11 +22,38 @@ from arview.geometry import Array
 from arview.guideviews import GuideViewSet
 from arview.pose import Identity, Pose
 from arview.tracking.estimate import Estimate
-from arview.tracking.identity.background_motion import BackgroundMotion, reduced
-from arview.tracking.identity.options import IdentityOptions
+from arview.tracking.identity.background_motion import MAX_SIDE_PX, BackgroundMotion, reduced
 from arview.tracking.identity.own_motion import OwnMotion
 from arview.tracking.identity.part_outline import PartOutline, PartPlace, transfer
-from arview.tracking.identity.specimen_search import Finders, SpecimenSearch
+from arview.tracking.identity.specimen_search import PIXEL_MARGIN, SAME_DEPTH, SAME_DEPTH_SHARE, Finders, SpecimenSearch
+
+IS_USED = True
+"""Look after the identity at all; without it every pose is ``followed``."""
+QUALITY_RATE = 0.1
+"""Share by which the usual quality of the followed specimen follows each frame, from 0."""
+SURE_QUALITY = 0.6
+"""Usual quality from which its pose is certainly right; below, the detector is asked."""
+MIN_QUALITY = 0.5
+"""Quality from which a pose counts as tracked."""
+MAX_JUMP = 0.35
+"""Shift between two frames, in diameters of the part in the picture, from which a pose is compared with the place at
+which the background says that the part was."""
+SAME_PLACE = 0.35
+"""Shift from that place, in diameters of the part in the picture, up to which a pose is the same part, because two
+specimens do not stand in one place."""
+MAX_UNKNOWN_FRAMES = 5
+"""Frames without a sure pose up to which a pose near the last one is the same part although the motion of the
+background is not known."""
+WATCH_S = 0.75
+"""Time for which the old place is watched before a part that was found elsewhere has its labels back."""
+WATCH_EVERY_S = 0.25
+"""Time between two checks of the old place."""
+MIN_ROOM = 0.7
+"""Share of the part's box that must lie in the picture for its place to count as seen."""
+RETURN_EVERY_S = 0.35
+"""Time between two checks whether the followed part is seen at its old place again."""
+RETURN_S = 10.0
+"""Time after the doubt arose for which the old place is followed."""
 
 CHECKING = "checking that this is the part that was followed before"
 ANOTHER_IN_VIEW = "another part of this kind is in view; confirm that this is the one"
@@ -100,7 +127,6 @@ class IdentityMonitor:
     Args:
         views: guide views of the part.
         camera: intrinsics of the frames.
-        options: see `IdentityOptions`.
         serials: serial number of the followed specimen, and which codes name one; None: codes are not read.
     """
 
@@ -108,16 +134,14 @@ class IdentityMonitor:
         self,
         views: GuideViewSet,
         camera: Camera,
-        options: IdentityOptions | None = None,
         serials: SerialNumbers | None = None,
     ) -> None:
-        self.options = o = options or IdentityOptions()
         self.outline = PartOutline(views, camera)
-        self._search = SpecimenSearch(self.outline, o)
-        self._motion = BackgroundMotion(self.outline, o.background)
-        self._own_motion = OwnMotion(self.outline, o.own_motion)
+        self._search = SpecimenSearch(self.outline)
+        self._motion = BackgroundMotion(self.outline)
+        self._own_motion = OwnMotion(self.outline)
         self._serials = serials
-        self._reader = None if serials is None else SerialCodeReader(serials, o.code)
+        self._reader = None if serials is None else SerialCodeReader(serials)
         self._named_at: tuple[int, Array] | None = None
         self.reset()
 
@@ -180,7 +204,7 @@ class IdentityMonitor:
         if serials == self._serials:
             return
         self._serials = serials
-        self._reader = None if serials is None else SerialCodeReader(serials, self.options.code)
+        self._reader = None if serials is None else SerialCodeReader(serials)
         if not self._serial:
             return
         # What was read from the part is still true; what it means is not.
@@ -209,7 +233,7 @@ class IdentityMonitor:
             finders: the searches of the session.
             is_confirmed: whether the pose has been supported clearly since it was found.
         """
-        if not self.options.is_used:
+        if not IS_USED:
             return IdentityResult()
         self._frame += 1
         moved_to = self._at_named_pixel(image, estimate, index, finders)
@@ -218,7 +242,7 @@ class IdentityMonitor:
             return self._result(moved_to)
         pose = estimate.cam_from_model
         self._place = self.outline.place(pose)
-        is_sure = is_confirmed and estimate.quality >= self.options.min_quality and not estimate.is_restless
+        is_sure = is_confirmed and estimate.quality >= MIN_QUALITY and not estimate.is_restless
         if self._doubt is None:
             placement = self._placement(image, pose, is_sure)
             self._follow(image, estimate, is_sure, placement, time_s, finders.others)
@@ -250,7 +274,7 @@ class IdentityMonitor:
         if self._last_place is None or self._is_jump():
             self._motion.match(pose)
         placement = self._compared(pose, self._motion.homography)
-        is_brief = self._frames_unsure <= self.options.max_unknown_frames
+        is_brief = self._frames_unsure <= MAX_UNKNOWN_FRAMES
         if placement is Placement.UNKNOWN and (is_brief or self._last_place is not None):
             near = self._last_place or self.outline.place(self._kept.cam_from_model)
             if not self._is_shifted(near, self._place):
@@ -282,7 +306,7 @@ class IdentityMonitor:
         # Copied, because a source may use the memory of its frames again.
         np.copyto(self._buffer, image)
         self._kept = KeptView(self._buffer, pose, others)
-        self._kept_quality += self.options.quality_rate * (quality - self._kept_quality)
+        self._kept_quality += QUALITY_RATE * (quality - self._kept_quality)
         self._others_before = None
         self._is_followed = False
 
@@ -291,7 +315,7 @@ class IdentityMonitor:
         if self._kept is None:
             return
         if not self._is_followed:
-            picture = reduced(self._kept.image, self.options.background.max_side_px)
+            picture = reduced(self._kept.image, MAX_SIDE_PX)
             self._motion.start(picture, self._kept.cam_from_model)
             self._is_followed = True
         self._motion.follow(image, pose)
@@ -304,7 +328,7 @@ class IdentityMonitor:
         """Whether two places are farther apart than a part moves between two frames."""
         shift = np.linalg.norm(a.center_px - b.center_px) / max(a.diameter_px, b.diameter_px)
         depth_mm = abs(a.distance_mm - b.distance_mm)
-        return bool(shift > self.options.max_jump or depth_mm > self._max_depth_mm(a.distance_mm))
+        return bool(shift > MAX_JUMP or depth_mm > self._max_depth_mm(a.distance_mm))
 
     def _compared(self, pose: Array, homography: Array | None) -> Placement:
         """Where a pose (4,4) is, compared with the place to which a homography takes the followed specimen."""
@@ -314,14 +338,13 @@ class IdentityMonitor:
         pixel, scale, _ = transfer(homography, before.center_px)
         expected_mm = before.distance_mm / scale
         diameter_px = max(now.diameter_px, before.diameter_px * scale)
-        is_aside = np.linalg.norm(pixel - now.center_px) > self.options.same_place * diameter_px
+        is_aside = np.linalg.norm(pixel - now.center_px) > SAME_PLACE * diameter_px
         is_along = abs(now.distance_mm - expected_mm) > self._max_depth_mm(expected_mm)
         return Placement.AWAY if is_aside or is_along else Placement.SAME
 
     def _max_depth_mm(self, distance_mm: float) -> float:
         """Difference in distance up to which two poses are in one place."""
-        o = self.options
-        return max(o.same_depth * self.outline.views.diameter_mm, o.same_depth_share * distance_mm)
+        return max(SAME_DEPTH * self.outline.views.diameter_mm, SAME_DEPTH_SHARE * distance_mm)
 
     # --- Doubt --------------------------------------------------------------------------------------------
 
@@ -330,7 +353,7 @@ class IdentityMonitor:
         is_new = self._last_place is None or self._is_jump()
         if is_new:
             self._doubt = Doubt(time_s, time_s, reason=doubt.reason)
-        elif time_s - doubt.since_s > self.options.return_s:
+        elif time_s - doubt.since_s > RETURN_S:
             self._motion.homography = None
             return
         self._follow_background(image, pose)
@@ -347,7 +370,6 @@ class IdentityMonitor:
         finders: Finders,
     ) -> Array | None:
         """One step to settle a doubt; a pose (4,4) where the followed specimen is seen instead, or None."""
-        o = self.options
         placement = self._compared(pose, self._motion.homography)
         is_on_way = not doubt.reason and self._own_motion.leads_to(self._frame, pose)
         if is_sure and (placement is Placement.SAME or is_on_way):
@@ -363,7 +385,7 @@ class IdentityMonitor:
             if doubt.is_placed or doubt.reason:
                 return None
         if self._motion.homography is not None and time_s >= doubt.next_check_s:
-            doubt.next_check_s = time_s + (o.return_every_s if doubt.reason else o.watch_every_s)
+            doubt.next_check_s = time_s + (RETURN_EVERY_S if doubt.reason else WATCH_EVERY_S)
             seen = self._seen_at_old_place(image, pose, finders)
             if seen is not None:
                 doubt.reason = ANOTHER_IN_VIEW
@@ -390,7 +412,7 @@ class IdentityMonitor:
         assert kept is not None
         homography = np.eye(3) if self._motion.homography is None else self._motion.homography
         there = self.outline.moved(pose, np.asarray(np.linalg.inv(homography), dtype=np.float64))
-        if self.outline.is_in_picture(self.outline.place(there), self.options.min_room):
+        if self.outline.is_in_picture(self.outline.place(there), MIN_ROOM):
             seen = self._search.at_place(kept.image, there, finders, is_turned=True)
             if seen is not None and self._is_apart(seen, kept.cam_from_model):
                 return self._is_kept_right(kept, finders)
@@ -409,7 +431,7 @@ class IdentityMonitor:
 
     def _is_kept_right(self, kept: KeptView, finders: Finders) -> bool:
         """Whether the followed specimen is really there in its last picture; a wrong pose is no specimen."""
-        if self._kept_quality >= self.options.sure_quality:
+        if self._kept_quality >= SURE_QUALITY:
             return True
         return self._search.at_place(kept.image, kept.cam_from_model, finders) is not None
 
@@ -419,7 +441,7 @@ class IdentityMonitor:
             return None
         guess = self.outline.moved(self._kept.cam_from_model, self._motion.homography)
         place = self.outline.place(guess)
-        if not self.outline.is_in_picture(place, self.options.min_room):
+        if not self.outline.is_in_picture(place, MIN_ROOM):
             return None
         seen = self._search.at_place(image, guess, finders)
         return seen if seen is not None and self._is_apart(seen, pose) else None
@@ -435,7 +457,7 @@ class IdentityMonitor:
             self._settle(self._known)
         elif not doubt.has_seen_place:
             doubt.reason = MOVED
-        elif time_s - doubt.since_s >= self.options.watch_s:
+        elif time_s - doubt.since_s >= WATCH_S:
             self._settle(self._known)
 
     def _settle(self, identity: Identity, reason: str = "") -> None:
@@ -455,7 +477,7 @@ class IdentityMonitor:
         if self._named_at is None or index < self._named_at[0] or estimate is None:
             return None
         first, pixel = self._named_at
-        if self.outline.contains(estimate.cam_from_model, pixel, self.options.pixel_margin):
+        if self.outline.contains(estimate.cam_from_model, pixel, PIXEL_MARGIN):
             self.confirm()
             return None
         self._named_at = None

@@ -11,8 +11,24 @@ from collections import deque
 import numpy as np
 
 from arview.geometry import Array, rotation_angle_rad
-from arview.tracking.identity.options import OwnMotionOptions
 from arview.tracking.identity.part_outline import PartOutline
+
+FRAMES = 7
+"""Frames before the gap over which the motion is taken."""
+MAX_BREAK = 3
+"""Frames from one sure pose to the next up to which the motion between them is taken."""
+WRONG_FRAMES = 2
+"""The last of them whose poses may have been wrong."""
+MAX_GAP = 15
+"""Frames without a sure pose up to which it is continued."""
+NEAR = 0.2
+"""Shift in diameters from the expected place, across the line of sight, up to which the part is there."""
+NEAR_DEPTH = 0.6
+"""The same along the line of sight."""
+REACH = 0.6
+"""Shift in diameters from the last place beyond which another specimen may stand."""
+MAX_TURN_DEG = 45.0
+"""Rotation since the last pose up to which it is the same part."""
 
 
 class OwnMotion:
@@ -20,12 +36,11 @@ class OwnMotion:
 
     Args:
         outline: of the part.
-        options: see `OwnMotionOptions`.
     """
 
-    def __init__(self, outline: PartOutline, options: OwnMotionOptions) -> None:
-        self._outline, self._options = outline, options
-        self._recent: deque[tuple[int, Array]] = deque(maxlen=options.frames)
+    def __init__(self, outline: PartOutline) -> None:
+        self._outline = outline
+        self._recent: deque[tuple[int, Array]] = deque(maxlen=FRAMES)
 
     def reset(self) -> None:
         """Forget all poses."""
@@ -33,7 +48,7 @@ class OwnMotion:
 
     def add(self, frame: int, cam_from_model: Array) -> None:
         """A pose (4,4) without doubt in a frame, by its number; the motion goes on over a short break."""
-        if self._recent and frame - self._recent[-1][0] > self._options.max_break:
+        if self._recent and frame - self._recent[-1][0] > MAX_BREAK:
             self._recent.clear()
         self._recent.append((frame, cam_from_model))
 
@@ -43,21 +58,21 @@ class OwnMotion:
         The last poses before a loss may have been wrong already: it is enough that those before them lead there.
         """
         shown = list(self._recent)
-        ends = range(len(shown), max(len(shown) - self._options.wrong_frames - 1, 1), -1)
+        ends = range(len(shown), max(len(shown) - WRONG_FRAMES - 1, 1), -1)
         return any(self._is_on_way(shown[0], shown[end - 1], (frame, cam_from_model)) for end in ends)
 
     def _is_on_way(self, before: tuple[int, Array], last: tuple[int, Array], found: tuple[int, Array]) -> bool:
         """Whether the motion between two frames, each by its number and pose (4,4), leads on to a third."""
-        o, gap = self._options, found[0] - last[0]
-        if not 0 < gap <= o.max_gap or np.rad2deg(rotation_angle_rad(found[1], last[1])) > o.max_turn_deg:
+        gap = found[0] - last[0]
+        if not 0 < gap <= MAX_GAP or np.rad2deg(rotation_angle_rad(found[1], last[1])) > MAX_TURN_DEG:
             return False
         start, end, place = (self._outline.center_in_cam(pose) for _, pose in (before, last, found))
         expected = end + (end - start) * (gap / (last[0] - before[0]))
         if expected[2] <= 0.0:
             return False
-        is_near = self._across(place, expected) < o.near and self._across(place, end) < o.reach
+        is_near = self._across(place, expected) < NEAR and self._across(place, end) < REACH
         along_mm = abs(float(np.linalg.norm(place) - np.linalg.norm(expected)))
-        return is_near and along_mm < o.near_depth * self._outline.views.diameter_mm
+        return is_near and along_mm < NEAR_DEPTH * self._outline.views.diameter_mm
 
     def _across(self, a: Array, b: Array) -> float:
         """Distance of two centres (3,) across the line of sight, at the mean distance, in diameters."""

@@ -11,9 +11,26 @@ from numpy.typing import NDArray
 from arview.detection.detector import Detection
 from arview.geometry import Array, exp_so3, rigid
 from arview.tracking.guided_init import GuidedPose
-from arview.tracking.identity.options import IdentityOptions
 from arview.tracking.identity.part_outline import PartOutline, PartPlace
 from arview.tracking.several.specimens import hide_specimens
+
+FOUND_QUALITY = 0.7
+"""Quality of a pose found near a given one from which a specimen is there."""
+TURN_DEG = 25.0
+"""Angle by which a given pose is turned, where the camera may have gone round the part."""
+SAME_DEPTH = 0.6
+SAME_DEPTH_SHARE = 0.12
+"""The same along the line of sight, in diameters, and as a share of the distance; the larger limit counts."""
+APART = 0.5
+"""Shift in diameters from which a second detection is another specimen."""
+MAX_SPECIMENS = 3
+"""Specimens looked for in one picture."""
+PIXEL_TURNS_DEG: tuple[float, ...] = (0.0, 25.0, -25.0, 50.0, -50.0)
+PIXEL_DISTANCES: tuple[float, ...] = (1.0, 0.8, 1.25, 0.64, 1.56)
+"""Rotations about the vertical axis of the picture, and distances relative to that of the tracked part, that are tried
+first for a part at a named pixel."""
+PIXEL_MARGIN = 0.03
+"""Distance from the outline, in diameters, at which a named pixel still lies on a part."""
 
 
 class PictureFinder(Protocol):
@@ -56,24 +73,23 @@ class SpecimenSearch:
 
     Args:
         outline: of the part.
-        options: see `IdentityOptions`.
     """
 
-    def __init__(self, outline: PartOutline, options: IdentityOptions) -> None:
-        self._outline, self._options = outline, options
+    def __init__(self, outline: PartOutline) -> None:
+        self._outline = outline
 
     def others(
         self, image: NDArray[np.uint8], known: Array, finders: Finders, is_thorough: bool = False
-    ) -> list[Array]:  # fmt: skip
+    ) -> list[Array]:
         """Poses (4,4) of the part in an image (H,W,3) uint8 RGB, apart from a known one (4,4)."""
         place = self._outline.place(known)
         picture = hide_specimens(image, [known], self._outline.views, self._outline.camera)
-        found = finders.detector.detect(picture, self._options.max_specimens, is_thorough)
+        found = finders.detector.detect(picture, MAX_SPECIMENS, is_thorough)
         return [one.cam_from_model for one in found if self.is_apart(self._outline.place(one.cam_from_model), place)]
 
     def at_place(
         self, image: NDArray[np.uint8], guess: Array, finders: Finders, is_turned: bool = False
-    ) -> Array | None:  # fmt: skip
+    ) -> Array | None:
         """The pose (4,4) of a part at the place of a rough pose (4,4); None without one there.
 
         Args:
@@ -85,7 +101,7 @@ class SpecimenSearch:
         wanted = self._outline.place(guess)
         for start in self._turned(guess) if is_turned else [guess]:
             found = finders.guided_init.find(image, start)
-            is_there = found is not None and found.quality >= self._options.found_quality
+            is_there = found is not None and found.quality >= FOUND_QUALITY
             if found and is_there and self._is_near(self._outline.place(found.cam_from_model), wanted):
                 return found.cam_from_model
         return None
@@ -95,21 +111,20 @@ class SpecimenSearch:
 
         Parts on one bench are seen from about the same side, so those of the known pose are tried before all others.
         """
-        o = self._options
         shift = np.eye(3)
         shift[:2, 2] = pixel - self._outline.place(known).center_px
         start = self._outline.moved(known, shift)
         guesses = []
-        for turn_deg in o.pixel_turns_deg:
+        for turn_deg in PIXEL_TURNS_DEG:
             turned = self._turned_by(start, exp_so3([0.0, np.deg2rad(turn_deg), 0.0]))
-            guesses += [self._farther(turned, factor) for factor in o.pixel_distances]
+            guesses += [self._farther(turned, factor) for factor in PIXEL_DISTANCES]
         for guess in guesses:
             found = finders.guided_init.find(image, guess)
-            is_good = found is not None and found.quality >= o.found_quality
-            if found and is_good and self._outline.contains(found.cam_from_model, pixel, o.pixel_margin):
+            is_good = found is not None and found.quality >= FOUND_QUALITY
+            if found and is_good and self._outline.contains(found.cam_from_model, pixel, PIXEL_MARGIN):
                 return found.cam_from_model
         for other in self.others(image, known, finders, is_thorough=True):
-            if self._outline.contains(other, pixel, o.pixel_margin):
+            if self._outline.contains(other, pixel, PIXEL_MARGIN):
                 return other
         return None
 
@@ -119,18 +134,17 @@ class SpecimenSearch:
         Of two poses before each other one is wrong, because a specimen would hide the other.
         """
         aside_px = float(np.linalg.norm(a.center_px - b.center_px))
-        return aside_px > self._options.apart * max(a.diameter_px, b.diameter_px)
+        return aside_px > APART * max(a.diameter_px, b.diameter_px)
 
     def _is_near(self, a: PartPlace, b: PartPlace) -> bool:
         """Whether a place is about another one, also along the line of sight."""
-        o = self._options
-        far_mm = 2.0 * max(o.same_depth * self._outline.views.diameter_mm, o.same_depth_share * b.distance_mm)
+        far_mm = 2.0 * max(SAME_DEPTH * self._outline.views.diameter_mm, SAME_DEPTH_SHARE * b.distance_mm)
         return not self.is_apart(a, b) and abs(a.distance_mm - b.distance_mm) <= far_mm
 
     def _turned(self, cam_from_model: Array) -> list[Array]:
         """A pose (4,4), and poses with the part turned about its centre around the axes across the line of sight."""
         turns = [np.eye(3)]
-        angle_rad = np.deg2rad(self._options.turn_deg)
+        angle_rad = np.deg2rad(TURN_DEG)
         for x, y in ((0.0, 1.0), (0.0, -1.0), (1.0, 0.0), (-1.0, 0.0)):
             turns.append(exp_so3(angle_rad * np.array([x, y, 0.0])))
         return [self._turned_by(cam_from_model, turn) for turn in turns]

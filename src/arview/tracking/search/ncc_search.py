@@ -7,7 +7,6 @@ results are rough poses; whether the part is there is decided by the detector.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import cv2
@@ -16,7 +15,6 @@ from numpy.typing import NDArray
 
 from arview.core.kernel import kernel
 from arview.core.parallel import single_threaded_blas
-from arview.errors import InputError
 from arview.geometry import Array, are_near, exp_so3, rigid, rolls_between, turns_to_rays
 from arview.tracking.search.view_crops import PART_PX, ViewCropper
 from arview.tracking.search.window_search import FINE_PART_PX, NOISE, WindowSearch
@@ -29,57 +27,44 @@ NEIGHBOUR_STEPS = np.array([1.0, 1.0, 0.1, 0.05])
 """First steps of a pattern search from a placement that is nearly right: u px, v px, roll rad, ratio of sizes."""
 
 
-@dataclass(frozen=True)
-class NccSearchOptions:
-    """Options of the search.
-
-    Attributes:
-        roll_steps: rolls searched in a full turn.
-        stretch: ratio of neighbouring distances that are searched.
-        range_margin: share by which the declared range of distances is enlarged at both ends.
-        near_views: views searched when only views near a known pose are wanted.
-        near_deg: largest difference from the known pose in direction of view and in roll then.
-        near_stretch: largest ratio to the known distance then.
-        windows: best windows of the first search that are examined at each distance.
-        views_per_window: views examined in each window.
-        refined: placements refined by the pattern search.
-        per_place: placements refined at one place in the picture.
-        place_reach: size of a place, in diameters of the part.
-        neighbour_searches: best placements at which views from other directions are tried, too.
-        neighbour_views: views tried there.
-        neighbour_deg: largest difference in direction of view of these views.
-        min_score: correlation of a result.
-        min_share: share of the best correlation that a result needs.
-        max_results: results at most.
-        same_distance: results closer than this share of the diameter are the same when their rotations are, too.
-        same_deg: rotations that differ by less are the same.
-    """
-
-    roll_steps: int = 20
-    stretch: float = 1.2
-    range_margin: float = 0.1
-    near_views: int = 12
-    near_deg: float = 45.0
-    near_stretch: float = 1.5
-    windows: int = 18
-    views_per_window: int = 4
-    refined: int = 24
-    per_place: int = 3
-    place_reach: float = 0.3
-    neighbour_searches: int = 3
-    neighbour_views: int = 6
-    neighbour_deg: float = 40.0
-    min_score: float = 0.55
-    min_share: float = 0.8
-    max_results: int = 2
-    same_distance: float = 0.15
-    same_deg: float = 25.0
-
-    def __post_init__(self) -> None:
-        if self.roll_steps < 4 or self.max_results < 1:
-            raise InputError("appearance search: expected roll_steps ≥ 4 and max_results ≥ 1")
-        if not self.stretch > 1.0:
-            raise InputError(f"appearance search: stretch = {self.stretch}, expected more than 1")
+ROLL_STEPS = 20
+"""Rolls searched in a full turn."""
+STRETCH = 1.2
+"""Ratio of neighbouring distances that are searched."""
+RANGE_MARGIN = 0.1
+"""Share by which the declared range of distances is enlarged at both ends."""
+NEAR_VIEWS = 12
+"""Views searched when only views near a known pose are wanted."""
+NEAR_DEG = 45.0
+"""Largest difference from the known pose in direction of view and in roll then."""
+NEAR_STRETCH = 1.5
+"""Largest ratio to the known distance then."""
+WINDOWS = 18
+"""Best windows of the first search that are examined at each distance."""
+VIEWS_PER_WINDOW = 4
+"""Views examined in each window."""
+REFINED = 24
+"""Placements refined by the pattern search."""
+PER_PLACE = 3
+"""Placements refined at one place in the picture."""
+PLACE_REACH = 0.3
+"""Size of a place, in diameters of the part."""
+NEIGHBOUR_SEARCHES = 3
+"""Best placements at which views from other directions are tried, too."""
+NEIGHBOUR_VIEWS = 6
+"""Views tried there."""
+NEIGHBOUR_DEG = 40.0
+"""Largest difference in direction of view of these views."""
+MIN_SCORE = 0.55
+"""Correlation of a result."""
+MIN_SHARE = 0.8
+"""Share of the best correlation that a result needs."""
+MAX_RESULTS = 2
+"""Results at most."""
+SAME_DISTANCE = 0.15
+"""Results closer than this share of the diameter are the same when their rotations are, too."""
+SAME_DEG = 25.0
+"""Rotations that differ by less are the same."""
 
 
 class StoredViews(NamedTuple):
@@ -102,9 +87,12 @@ class StoredViews(NamedTuple):
     def first(self, count: int) -> StoredViews:
         """The first views."""
         return StoredViews(
-            self.rotations[:count], self.pictures[:count], self.masks[:count], self.templates[:count],
+            self.rotations[:count],
+            self.pictures[:count],
+            self.masks[:count],
+            self.templates[:count],
             self.weights[:count],
-        )  # fmt: skip
+        )
 
 
 class AppearanceMatch(NamedTuple):
@@ -142,11 +130,9 @@ class NccSearch:
 
     Args:
         cropper: part and camera.
-        options: see `NccSearchOptions`.
     """
 
-    def __init__(self, cropper: ViewCropper, options: NccSearchOptions | None = None) -> None:
-        self.options = options or NccSearchOptions()
+    def __init__(self, cropper: ViewCropper) -> None:
         self._cropper = cropper
         self._views = cropper.views
         self._camera = cropper.camera
@@ -160,13 +146,12 @@ class NccSearch:
             near: (4,4) last known ``cam_from_model``. Only views, rolls and distances near it are searched, at all
                 positions; None: all views, rolls and declared distances.
         """
-        o = self.options
         chosen, distances_mm = self._search_space(stored.rotations, near)
         if not len(chosen) or not len(distances_mm):
             return []
         views, rolls = chosen.T
         windows = WindowSearch(
-            stored.templates[views, rolls], stored.weights[views, rolls], views, o.windows, o.views_per_window
+            stored.templates[views, rolls], stored.weights[views, rolls], views, WINDOWS, VIEWS_PER_WINDOW
         )
         pictures = self._scaled_pictures(image, distances_mm)
         with single_threaded_blas():
@@ -175,27 +160,26 @@ class NccSearch:
         for level, places in enumerate(found):
             for center, template in places:
                 view, step = chosen[template]
-                roll = 2.0 * np.pi * step / o.roll_steps
+                roll = 2.0 * np.pi * step / ROLL_STEPS
                 starts.append(ViewPlacement(0.0, np.array([*center, roll, FINE_PART_PX / PART_PX]), level, int(view)))
         return self._select(self._refine(starts, pictures, stored), pictures, stored)
 
     def _search_space(self, rotations: Array, near: Array | None) -> tuple[NDArray[np.intp], Array]:
         """Views and rolls (T,2) to search for, and distances (D,) mm."""
-        o = self.options
         low, high = self._views.view_range.for_camera(self._camera, self._views.diameter_mm).distance_mm
-        low, high = (1.0 - o.range_margin) * low, (1.0 + o.range_margin) * high
-        rolls = 2.0 * np.pi * np.arange(o.roll_steps) / o.roll_steps
+        low, high = (1.0 - RANGE_MARGIN) * low, (1.0 + RANGE_MARGIN) * high
+        rolls = 2.0 * np.pi * np.arange(ROLL_STEPS) / ROLL_STEPS
         if near is None:
-            is_chosen = np.ones((len(rotations), o.roll_steps), dtype=bool)
+            is_chosen = np.ones((len(rotations), ROLL_STEPS), dtype=bool)
         else:
             rotation, _, distance_mm = self._cropper.axis_pose(near)
-            min_cosine = np.cos(np.deg2rad(o.near_deg))
+            min_cosine = np.cos(np.deg2rad(NEAR_DEG))
             cosines = rotations[:, 2] @ rotation[2]
-            is_near = (cosines > min_cosine) & (cosines >= np.sort(cosines)[-o.near_views :][:1].min(initial=1.0))
+            is_near = (cosines > min_cosine) & (cosines >= np.sort(cosines)[-NEAR_VIEWS:][:1].min(initial=1.0))
             last = rolls_between(rotations, rotation)
             is_chosen = is_near[:, None] & (np.cos(rolls - last[:, None]) > min_cosine)
-            low, high = max(low, distance_mm / o.near_stretch), min(high, distance_mm * o.near_stretch)
-        count = int(np.ceil(np.log(max(high / low, 1.0)) / np.log(o.stretch))) + 1
+            low, high = max(low, distance_mm / NEAR_STRETCH), min(high, distance_mm * NEAR_STRETCH)
+        count = int(np.ceil(np.log(max(high / low, 1.0)) / np.log(STRETCH))) + 1
         return np.argwhere(is_chosen), np.geomspace(low, max(high, low), count)
 
     def _scaled_pictures(self, image: NDArray[np.uint8], distances_mm: Array) -> list[NDArray[np.float32]]:
@@ -217,10 +201,9 @@ class NccSearch:
         self, starts: list[ViewPlacement], pictures: list[NDArray[np.float32]], stored: StoredViews
     ) -> list[ViewPlacement]:
         """The best placements after a pattern search, best first."""
-        o = self.options
         if not starts:
             return []
-        steps = np.array([1.0, 1.0, np.pi / o.roll_steps, 0.5 * (o.stretch - 1.0)])
+        steps = np.array([1.0, 1.0, np.pi / ROLL_STEPS, 0.5 * (STRETCH - 1.0)])
         found = []
         for k in self._spread(starts, pictures, stored):
             start = starts[k]
@@ -229,7 +212,7 @@ class NccSearch:
             )
             found.append(ViewPlacement(float(score), place, start.level, start.view))
         found.sort(key=lambda item: -item.score)
-        count = o.neighbour_searches
+        count = NEIGHBOUR_SEARCHES
         found[:count] = [self._try_neighbours(pictures[item.level], item, stored) for item in found[:count]]
         found.sort(key=lambda item: -item.score)
         return found
@@ -238,7 +221,6 @@ class NccSearch:
         self, starts: list[ViewPlacement], pictures: list[NDArray[np.float32]], stored: StoredViews
     ) -> list[int]:
         """Indices of the best placements as they are, few at each place of the picture."""
-        o = self.options
         none = np.zeros(4)
         scores = np.array(
             [
@@ -249,24 +231,23 @@ class NccSearch:
         # Places are compared in units of the picture's width, reach in diameters of the part at its distance.
         widths = np.array([pictures[s.level].shape[1] - 2 * FINE_PAD for s in starts])
         centers = (np.array([s.place[:2] for s in starts]) - FINE_PAD) / widths[:, None]
-        reach = (o.place_reach * FINE_PART_PX / widths) ** 2
+        reach = (PLACE_REACH * FINE_PART_PX / widths) ** 2
         chosen: list[int] = []
         for k in np.argsort(-scores):
-            if len(chosen) == o.refined:
+            if len(chosen) == REFINED:
                 break
             distances = ((centers[chosen] - centers[k]) ** 2).sum(axis=1)
-            if np.count_nonzero(distances < reach[k]) < o.per_place:
+            if np.count_nonzero(distances < reach[k]) < PER_PLACE:
                 chosen.append(int(k))
         return chosen
 
     def _try_neighbours(self, picture: NDArray[np.float32], found: ViewPlacement, stored: StoredViews) -> ViewPlacement:
         """A placement, or that of a view from a direction nearby, if it correlates better at the same place."""
-        o = self.options
         best = found
         rotation = exp_so3(np.array([0.0, 0.0, found.place[2]])) @ stored.rotations[found.view]
         cosines = stored.rotations[:, 2] @ rotation[2]
-        for k in np.argsort(-cosines)[: o.neighbour_views + 1]:
-            if k == found.view or cosines[k] < np.cos(np.deg2rad(o.neighbour_deg)):
+        for k in np.argsort(-cosines)[: NEIGHBOUR_VIEWS + 1]:
+            if k == found.view or cosines[k] < np.cos(np.deg2rad(NEIGHBOUR_DEG)):
                 continue
             start = found.place.copy()
             start[2] = rolls_between(stored.rotations[k], rotation)
@@ -279,11 +260,10 @@ class NccSearch:
         self, found: list[ViewPlacement], pictures: list[NDArray[np.float32]], stored: StoredViews
     ) -> list[AppearanceMatch]:
         """The best placements as poses, each different from the others."""
-        o = self.options
-        min_score = max(o.min_score, o.min_share * found[0].score) if found else 0.0
+        min_score = max(MIN_SCORE, MIN_SHARE * found[0].score) if found else 0.0
         results: list[AppearanceMatch] = []
         for item in found:
-            if item.score < min_score or len(results) == o.max_results:
+            if item.score < min_score or len(results) == MAX_RESULTS:
                 break
             pose = self._pose(pictures[item.level], stored.rotations[item.view], item.place)
             if not any(self._is_same(pose, other.cam_from_model) for other in results):
@@ -304,16 +284,20 @@ class NccSearch:
 
     def _is_same(self, a: Array, b: Array) -> bool:
         """Whether the detector would refine two poses (4,4) to the same one."""
-        o = self.options
         model_from_body = rigid(np.eye(3), self._views.center_in_model)
-        return are_near(a @ model_from_body, b @ model_from_body, o.same_distance * self._views.diameter_mm, o.same_deg)
+        return are_near(a @ model_from_body, b @ model_from_body, SAME_DISTANCE * self._views.diameter_mm, SAME_DEG)
 
 
 @kernel(fastmath=True)
 def _correlation(
-    image: NDArray[np.float32], picture: NDArray[np.uint8], mask: NDArray[np.uint8], u: float, v: float, roll: float,
-    ratio: float
-) -> float:  # fmt: skip
+    image: NDArray[np.float32],
+    picture: NDArray[np.uint8],
+    mask: NDArray[np.uint8],
+    u: float,
+    v: float,
+    roll: float,
+    ratio: float,
+) -> float:
     """Masked normalised correlation of a view with an image, all channels together; -1 mostly outside the image.
 
     The view is placed with its centre at (u, v) px, turned by ``roll`` rad and scaled by ``ratio``. Pixels outside the
@@ -358,9 +342,13 @@ def _correlation(
 
 @kernel
 def pattern_search(
-    image: NDArray[np.float32], picture: NDArray[np.uint8], mask: NDArray[np.uint8], start: NDArray[np.float64],
-    steps: NDArray[np.float64], halvings: int
-) -> tuple[float, NDArray[np.float64]]:  # fmt: skip
+    image: NDArray[np.float32],
+    picture: NDArray[np.uint8],
+    mask: NDArray[np.uint8],
+    start: NDArray[np.float64],
+    steps: NDArray[np.float64],
+    halvings: int,
+) -> tuple[float, NDArray[np.float64]]:
     """Pattern search (Hooke & Jeeves, 1961) for the best correlation of a view.
 
     Args:

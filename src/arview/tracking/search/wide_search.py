@@ -8,8 +8,6 @@ are refined by a pattern search there, and again at twice the resolution.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -24,41 +22,33 @@ from arview.geometry import Array, turn_ball
 from arview.refinement.modalities.region import BINS, ColorModel
 from arview.refinement.projection import ViewArrays
 
-
-@dataclass(frozen=True)
-class WideSearchOptions:
-    """Options of the search.
-
-    Attributes:
-        radii_px: half diameter of the part in the pictures of the two rounds.
-        turn_reach_deg: largest rotation tried.
-        turn_step_deg: distance of the rotations tried.
-        stretches: factors of the distance tried.
-        shift: largest shift tried, in half diameters.
-        shift_step_px: distance of the shifts tried, px of the first round's picture.
-        points: points of the outline, and as many of design edges, that are scored.
-        refined: poses refined by the pattern search in the two rounds.
-        kept: poses returned.
-        search_steps_deg: first rotations of the pattern search in the two rounds.
-        search_stretches: first relative changes of the distance in the two rounds.
-        separation_deg: smallest difference between the poses that go into the two pattern searches and are returned;
-            1° corresponds to 1 % of the diameter.
-        crop_margin: half size of the crops of the two rounds, in half diameters, without shifts.
-    """
-
-    radii_px: tuple[float, float] = (26.0, 52.0)
-    turn_reach_deg: float = 42.0
-    turn_step_deg: float = 18.0
-    stretches: tuple[float, ...] = (0.93, 1.0, 1.075)
-    shift: float = 0.7
-    shift_step_px: int = 3
-    points: int = 48
-    refined: tuple[int, int] = (12, 6)
-    kept: int = 4
-    search_steps_deg: tuple[float, float] = (7.0, 3.0)
-    search_stretches: tuple[float, float] = (0.04, 0.02)
-    separation_deg: tuple[float, float, float] = (10.0, 5.0, 2.5)
-    crop_margin: tuple[float, float] = (1.1, 1.25)
+RADII_PX = (26.0, 52.0)
+"""Half diameter of the part in the pictures of the two rounds."""
+TURN_REACH_DEG = 42.0
+"""Largest rotation tried."""
+TURN_STEP_DEG = 18.0
+"""Distance of the rotations tried."""
+STRETCHES: tuple[float, ...] = (0.93, 1.0, 1.075)
+"""Factors of the distance tried."""
+SHIFT = 0.7
+"""Largest shift tried, in half diameters."""
+SHIFT_STEP_PX = 3
+"""Distance of the shifts tried, px of the first round's picture."""
+POINTS = 48
+"""Points of the outline, and as many of design edges, that are scored."""
+REFINED = (12, 6)
+"""Poses refined by the pattern search in the two rounds."""
+KEPT = 4
+"""Poses returned."""
+SEARCH_STEPS_DEG = (7.0, 3.0)
+"""First rotations of the pattern search in the two rounds."""
+SEARCH_STRETCHES = (0.04, 0.02)
+"""First relative changes of the distance in the two rounds."""
+SEPARATION_DEG = (10.0, 5.0, 2.5)
+"""Smallest difference between the poses that go into the two pattern searches and are returned; 1° corresponds to 1 %
+of the diameter."""
+CROP_MARGIN = (1.1, 1.25)
+"""Half size of the crops of the two rounds, in half diameters, without shifts."""
 
 
 class WideSearch:
@@ -69,7 +59,6 @@ class WideSearch:
         camera: camera of the frames.
         intrinsics: (10,) of the camera, as of `intrinsics_of`.
         diameter_mm: diameter of the part.
-        options: see `WideSearchOptions`.
     """
 
     def __init__(
@@ -78,15 +67,13 @@ class WideSearch:
         camera: Camera,
         intrinsics: Array,
         diameter_mm: float,
-        options: WideSearchOptions | None = None,
     ) -> None:
-        self.options = options or WideSearchOptions()
         self._part = part
         self._camera = camera
         self._intrinsics = intrinsics
         self._diameter_mm = diameter_mm
-        self._turns = turn_ball(self.options.turn_reach_deg, self.options.turn_step_deg)
-        self._stretches = np.array(self.options.stretches)
+        self._turns = turn_ball(TURN_REACH_DEG, TURN_STEP_DEG)
+        self._stretches = np.array(STRETCHES)
 
     def find(self, image: NDArray[np.uint8], colors: ColorModel, start: Array) -> list[Array]:
         """The best poses (4,4) ``cam_from_body`` around a start, best first; none where it is outside the picture.
@@ -96,51 +83,70 @@ class WideSearch:
             colors: colours of part and background.
             start: (4,4) ``cam_from_body``.
         """
-        o = self.options
         center = self._camera.project(start[:3, 3])
         if start[2, 3] <= 0 or not np.all(np.isfinite(center)):
             return []
         radius_px = 0.5 * self._diameter_mm * self._camera.fx / start[2, 3]
-        made = self._maps(image, colors, center, (o.crop_margin[0] + o.shift) * radius_px, o.radii_px[0] / radius_px)
+        made = self._maps(image, colors, center, (CROP_MARGIN[0] + SHIFT) * radius_px, RADII_PX[0] / radius_px)
         if made is None:
             return []
         maps, intrinsics = made
         step_mm = 0.01 * self._diameter_mm
-        shift_px = round(o.shift * o.radii_px[0])
+        shift_px = round(SHIFT * RADII_PX[0])
 
         def score(turns: Array) -> tuple[Array, Array]:
             return score_around(
-                maps, self._part, start, intrinsics, step_mm, turns, self._stretches, shift_px,
-                o.shift_step_px, o.points, o.points,
-            )  # fmt: skip
+                maps,
+                self._part,
+                start,
+                intrinsics,
+                step_mm,
+                turns,
+                self._stretches,
+                shift_px,
+                SHIFT_STEP_PX,
+                POINTS,
+                POINTS,
+            )
 
         found = list(pool().map(score, np.array_split(self._turns, 2)))
         scores, poses = np.concatenate([f[0] for f in found]), np.concatenate([f[1] for f in found])
-        poses = self._select(scores, poses, o.separation_deg[0], o.refined[0])[1]
-        scores, poses = self._refine(maps, poses, intrinsics, o.search_steps_deg[0], o.search_stretches[0])
-        scores, poses = self._select(scores, poses, o.separation_deg[1], o.refined[1])
+        poses = self._select(scores, poses, SEPARATION_DEG[0], REFINED[0])[1]
+        scores, poses = self._refine(maps, poses, intrinsics, SEARCH_STEPS_DEG[0], SEARCH_STRETCHES[0])
+        scores, poses = self._select(scores, poses, SEPARATION_DEG[1], REFINED[1])
         best = poses[0]
         radius_px = 0.5 * self._diameter_mm * self._camera.fx / best[2, 3]
         center = self._camera.project(best[:3, 3])
-        made = self._maps(image, colors, center, o.crop_margin[1] * radius_px, o.radii_px[1] / radius_px)
+        made = self._maps(image, colors, center, CROP_MARGIN[1] * radius_px, RADII_PX[1] / radius_px)
         if made is None:
             return []
         maps, intrinsics = made
-        scores, poses = self._refine(maps, poses, intrinsics, o.search_steps_deg[1], o.search_stretches[1])
-        scores, poses = self._select(scores, poses, o.separation_deg[2], o.kept)
+        scores, poses = self._refine(maps, poses, intrinsics, SEARCH_STEPS_DEG[1], SEARCH_STRETCHES[1])
+        scores, poses = self._select(scores, poses, SEPARATION_DEG[2], KEPT)
         return list(poses)
 
     def _refine(
         self, maps: NDArray[np.uint8], poses: Array, intrinsics: Array, turn_deg: float, stretch: float
     ) -> tuple[Array, Array]:
         """Scores and poses (N,4,4) after a pattern search from each of some poses (N,4,4)."""
-        points = self.options.points
+        points = POINTS
 
         def search(starts: Array) -> tuple[Array, Array]:
             return search_poses(
-                maps, self._part, starts, intrinsics, 0.01 * self._diameter_mm, np.deg2rad(turn_deg), stretch,
-                2, 1, 2, 1, points, points,
-            )  # fmt: skip
+                maps,
+                self._part,
+                starts,
+                intrinsics,
+                0.01 * self._diameter_mm,
+                np.deg2rad(turn_deg),
+                stretch,
+                2,
+                1,
+                2,
+                1,
+                points,
+                points,
+            )
 
         # Alternate poses go to the two threads, because the best ones take longer.
         results = list(pool().map(search, [np.ascontiguousarray(poses[k::2]) for k in range(2) if len(poses[k::2])]))
@@ -152,9 +158,13 @@ class WideSearch:
         scores, poses = scores[order], poses[order]
         reach = np.full(len(poses), 0.01 * separation_deg * self._diameter_mm) / poses[:, 2, 3]
         chosen = select_distinct(
-            np.ascontiguousarray(poses[:, :3, :3]), np.ascontiguousarray(poses[:, :3, 3]), reach,
-            np.cos(np.deg2rad(separation_deg)), 1.0 + 0.01 * separation_deg, max_count,
-        )  # fmt: skip
+            np.ascontiguousarray(poses[:, :3, :3]),
+            np.ascontiguousarray(poses[:, :3, 3]),
+            reach,
+            np.cos(np.deg2rad(separation_deg)),
+            1.0 + 0.01 * separation_deg,
+            max_count,
+        )
         return scores[chosen], np.ascontiguousarray(poses[chosen])
 
     def _maps(

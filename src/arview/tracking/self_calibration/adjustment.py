@@ -35,45 +35,38 @@ LOG_FOCAL = 0
 """Place of the logarithm of the focal length among the unknowns of the camera."""
 
 
-@dataclass(frozen=True)
-class AdjustmentOptions:
-    """Options of the joint adjustment.
-
-    Attributes:
-        spreads_px: expected distance of predicted from true edges in each round; all edges are measured anew in each.
-        reach: samples to either side of an edge, of which ``step_px`` is the distance.
-        step_px: see ``reach``.
-        threshold: weakest step used, grey levels over two pixels.
-        updates: Gauss-Newton steps of a round.
-        max_focal_step: largest change of the logarithm of the focal length in one step.
-        smooth_weight: weight of points on no sharp edge.
-        sigma_px: standard deviation of a single edge point.
-        correlated_points: neighbouring points that share one error; only sets the weight against what is known before.
-        focal_sigma: standard deviation of the logarithm of the focal length before the estimation.
-        center_sigma: the same of the principal point, as a share of the picture's longer side.
-        k1_sigma: the same of the radial distortion.
-        min_points: measured edge points that a frame must have.
-        significance: standard uncertainties by which the distortion must differ from none to be kept.
-        cell_share: rounding of the place of edges that are taken for one line, in diameters.
-        floor: smallest relative standard uncertainty, for what the model of the edges leaves out.
-    """
-
-    spreads_px: tuple[float, ...] = (6.0, 3.0, 1.5, 1.0, 0.7, 0.5)
-    reach: int = 12
-    step_px: float = 1.0
-    threshold: float = 3.0
-    updates: int = 4
-    max_focal_step: float = 0.15
-    smooth_weight: float = 0.3
-    sigma_px: float = 0.7
-    correlated_points: float = 8.0
-    focal_sigma: float = 0.5
-    center_sigma: float = 0.01
-    k1_sigma: float = 0.05
-    min_points: int = 40
-    significance: float = 5.0
-    cell_share: float = 0.05
-    floor: float = 0.003
+SPREADS_PX: tuple[float, ...] = (6.0, 3.0, 1.5, 1.0, 0.7, 0.5)
+"""Expected distance of predicted from true edges in each round; all edges are measured anew in each."""
+REACH = 12
+"""Samples to either side of an edge, of which ``STEP_PX`` is the distance."""
+STEP_PX = 1.0
+"""See ``REACH``."""
+THRESHOLD = 3.0
+"""Weakest step used, grey levels over two pixels."""
+UPDATES = 4
+"""Gauss-Newton steps of a round."""
+MAX_FOCAL_STEP = 0.15
+"""Largest change of the logarithm of the focal length in one step."""
+SMOOTH_WEIGHT = 0.3
+"""Weight of points on no sharp edge."""
+SIGMA_PX = 0.7
+"""Standard deviation of a single edge point."""
+CORRELATED_POINTS = 8.0
+"""Neighbouring points that share one error; only sets the weight against what is known before."""
+FOCAL_SIGMA = 0.5
+"""Standard deviation of the logarithm of the focal length before the estimation."""
+CENTER_SIGMA = 0.01
+"""The same of the principal point, as a share of the picture's longer side."""
+K1_SIGMA = 0.05
+"""The same of the radial distortion."""
+MIN_POINTS = 40
+"""Measured edge points that a frame must have."""
+SIGNIFICANCE = 5.0
+"""Standard uncertainties by which the distortion must differ from none to be kept."""
+CELL_SHARE = 0.05
+"""Rounding of the place of edges that are taken for one line, in diameters."""
+FLOOR = 0.003
+"""Smallest relative standard uncertainty, for what the model of the edges leaves out."""
 
 
 class Adjusted(NamedTuple):
@@ -109,26 +102,24 @@ class FocalAdjustment:
     Args:
         part: the part in the form of the kernels.
         guess: camera before the estimation, with equal focal lengths.
-        options: see `AdjustmentOptions`.
     """
 
-    def __init__(self, part: PartView, guess: Camera, options: AdjustmentOptions | None = None) -> None:
-        self.options = o = options or AdjustmentOptions()
+    def __init__(self, part: PartView, guess: Camera) -> None:
         self.guess = guess
         self._part = part
         self._diameter_mm = part.views.diameter_mm
         longer_px = max(guess.width, guess.height)
-        sigmas = np.array([o.focal_sigma, o.center_sigma * longer_px, o.center_sigma * longer_px, o.k1_sigma])
+        sigmas = np.array([FOCAL_SIGMA, CENTER_SIGMA * longer_px, CENTER_SIGMA * longer_px, K1_SIGMA])
         self._prior = np.diag(1.0 / sigmas**2)
         # Weight of a residual of one pixel against what is known before.
-        self._weight = 1.0 / (o.sigma_px**2 * o.correlated_points)
+        self._weight = 1.0 / (SIGMA_PX**2 * CORRELATED_POINTS)
 
     def information(self, frame: CalibrationFrame, camera: Camera) -> float:
         """Information of one frame alone on the logarithm of the focal length, all else of the camera being known."""
         pose = frame.pose_at(camera.fx)
-        spread_px = self.options.spreads_px[1]
+        spread_px = SPREADS_PX[1]
         equations = self._equations(frame, self._measure(frame, pose, camera, spread_px), pose, camera, spread_px)
-        if np.count_nonzero(equations.weights) < self.options.min_points:
+        if np.count_nonzero(equations.weights) < MIN_POINTS:
             return 0.0
         reduced, _, _, _ = self._reduced(equations)
         return float(reduced[LOG_FOCAL, LOG_FOCAL])
@@ -139,36 +130,34 @@ class FocalAdjustment:
         Principal point and distortion are adjusted as well, so that the uncertainty of the focal length holds whatever
         they are. The principal point is not kept, because edges tell it badly and it only shifts the poses.
         """
-        o = self.options
         found = self._adjust(frames, start)
         if found is None:
             return None
         camera, poses, used, rms_px = found
-        std = np.sqrt(np.diag(self._covariance(frames, used, poses, camera, o.spreads_px[-1])))
-        is_distorted = abs(camera.dist[0]) > o.significance * std[3]
+        std = np.sqrt(np.diag(self._covariance(frames, used, poses, camera, SPREADS_PX[-1])))
+        is_distorted = abs(camera.dist[0]) > SIGNIFICANCE * std[3]
         camera = replace(
             camera,
             cx=self.guess.cx,
             cy=self.guess.cy,
             dist=np.array([camera.dist[0] if is_distorted else 0.0, 0.0, 0.0, 0.0, 0.0]),
         )
-        return Adjusted(camera, float(max(std[LOG_FOCAL], o.floor)), used, rms_px)
+        return Adjusted(camera, float(max(std[LOG_FOCAL], FLOOR)), used, rms_px)
 
     def _adjust(
         self, frames: Sequence[CalibrationFrame], camera: Camera
     ) -> tuple[Camera, list[Array], list[int], float] | None:
         """Camera, poses, indices of the frames used, and residuals after several rounds; None without an edge."""
-        o = self.options
         poses = [frame.pose_at(camera.fx) for frame in frames]
         used = list(range(len(frames)))
         rms_px = float("nan")
-        for spread_px in o.spreads_px:
+        for spread_px in SPREADS_PX:
             measured = {i: self._measure(frames[i], poses[i], camera, spread_px) for i in used}
-            for _ in range(o.updates):
+            for _ in range(UPDATES):
                 system = {}
                 for i in used:
                     equations = self._equations(frames[i], measured[i], poses[i], camera, spread_px)
-                    if np.count_nonzero(equations.weights) >= o.min_points:
+                    if np.count_nonzero(equations.weights) >= MIN_POINTS:
                         system[i] = equations
                 used = list(system)
                 if not used:
@@ -183,15 +172,13 @@ class FocalAdjustment:
 
     def _measure(self, frame: CalibrationFrame, pose: Array, camera: Camera, spread_px: float) -> _Measured:
         """Edges of the nearest guide view, measured in a frame at a pose (4,4)."""
-        o, arrays = self.options, self._part.resolvable
+        arrays = self._part.resolvable
         view = nearest_view(arrays.directions, pose)
         chosen = slice(arrays.edge_starts[view], arrays.edge_starts[view + 1])
         points, tangents, kinds = arrays.edge_points[chosen], arrays.edge_tangents[chosen], arrays.edge_kinds[chosen]
-        lines = project_lines(
-            points, tangents, True, pose, frame.intrinsics(camera), 0.01 * self._diameter_mm
-        )  # fmt: skip
-        reach = max(5, round(min(o.reach, 2.5 * spread_px + 2.0)))
-        profiles = measure_edges(frame.gray, lines, reach, o.step_px, o.threshold)
+        lines = project_lines(points, tangents, True, pose, frame.intrinsics(camera), 0.01 * self._diameter_mm)
+        reach = max(5, round(min(REACH, 2.5 * spread_px + 2.0)))
+        profiles = measure_edges(frame.gray, lines, reach, STEP_PX, THRESHOLD)
         return _Measured(points, tangents, kinds, lines, profiles)
 
     def _equations(
@@ -199,9 +186,16 @@ class FocalAdjustment:
     ) -> EdgeEquations:
         """Equations of a frame; the columns of the principal point are in pixels of the whole frame."""
         equations = edge_equations(
-            measured.points, measured.kinds, pose, frame.intrinsics(camera), measured.lines, measured.profiles,
-            spread_px, STRENGTH_HALF, self.options.smooth_weight,
-        )  # fmt: skip
+            measured.points,
+            measured.kinds,
+            pose,
+            frame.intrinsics(camera),
+            measured.lines,
+            measured.profiles,
+            spread_px,
+            STRENGTH_HALF,
+            SMOOTH_WEIGHT,
+        )
         equations.jacobian[:, POSE_COLUMNS + 1 : POSE_COLUMNS + 3] *= frame.scale
         return equations
 
@@ -222,7 +216,6 @@ class FocalAdjustment:
 
     def _step(self, camera: Camera, poses: list[Array], system: list[EdgeEquations]) -> tuple[Camera, list[Array]]:
         """Camera and poses after one Gauss-Newton step."""
-        o = self.options
         parts = [self._reduced(equations) for equations in system]
         offset = np.array(
             [np.log(camera.fx / self.guess.fx), camera.cx - self.guess.cx, camera.cy - self.guess.cy, camera.dist[0]]
@@ -230,8 +223,8 @@ class FocalAdjustment:
         matrix = self._prior + np.sum([part[0] for part in parts], axis=0)
         right = self._prior @ offset + np.sum([part[1] for part in parts], axis=0)
         shared = -np.linalg.solve(matrix, right)
-        if abs(shared[LOG_FOCAL]) > o.max_focal_step:
-            shared *= o.max_focal_step / abs(shared[LOG_FOCAL])
+        if abs(shared[LOG_FOCAL]) > MAX_FOCAL_STEP:
+            shared *= MAX_FOCAL_STEP / abs(shared[LOG_FOCAL])
         factor = float(np.exp(shared[LOG_FOCAL]))
         moved = []
         for pose, equations, (_, _, inverse, coupling) in zip(poses, system, parts, strict=True):
@@ -275,9 +268,7 @@ class FocalAdjustment:
             scores.append(own * (weight * equations.residuals[is_used])[:, None])
             tangents = measured.tangents[is_used].astype(np.float64)
             labels.append(
-                line_labels(
-                    measured.points[is_used].astype(np.float64), tangents, self._diameter_mm, self.options.cell_share
-                )
+                line_labels(measured.points[is_used].astype(np.float64), tangents, self._diameter_mm, CELL_SHARE)
             )
             owners.append(np.full(len(weight), i))
         row, score = np.concatenate(rows), np.concatenate(scores)

@@ -35,10 +35,16 @@ class EdgeEquations(NamedTuple):
 
 @kernel
 def edge_equations(
-    points: NDArray[np.float32], kinds: NDArray[np.uint8], pose: NDArray[np.float64],
-    intrinsics: NDArray[np.float64], lines: ProjectedLines, profiles: EdgeProfiles, spread_px: float,
-    strength_half: float, smooth_weight: float
-) -> EdgeEquations:  # fmt: skip
+    points: NDArray[np.float32],
+    kinds: NDArray[np.uint8],
+    pose: NDArray[np.float64],
+    intrinsics: NDArray[np.float64],
+    lines: ProjectedLines,
+    profiles: EdgeProfiles,
+    spread_px: float,
+    strength_half: float,
+    smooth_weight: float,
+) -> EdgeEquations:
     """Equations of the best grey-level step of each point, chosen and weighted as by the edge modality.
 
     At a fixed picture size of the part's centre only its relative depth tells the focal length, so the column of the

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,39 +11,27 @@ from arview.camera import Camera
 from arview.geometry import Array
 from arview.pose import Pose
 from arview.refinement.view_model import PartView
-from arview.tracking.self_calibration.adjustment import Adjusted, AdjustmentOptions, FocalAdjustment
-from arview.tracking.self_calibration.frame_set import CalibrationFrame, FrameSet, FrameSetOptions, cropped_frame
+from arview.tracking.self_calibration.adjustment import Adjusted, FocalAdjustment
+from arview.tracking.self_calibration.frame_set import CalibrationFrame, FrameSet, cropped_frame
 
-
-@dataclass(frozen=True)
-class FocalOptions:
-    """Options of the estimation.
-
-    Attributes:
-        min_quality: quality of a pose below which its frame is not used.
-        min_frames: frames without which nothing is estimated.
-        new_frames: frames that must have been added for a second estimate; each later one takes one more.
-        max_std: relative standard uncertainty above which the focal length counts as undetermined.
-        sure_std: relative standard uncertainty above which ``many_frames`` are needed as well.
-        many_frames: see ``sure_std``.
-        enough_std: relative standard uncertainty at which more frames are not needed.
-        inflation: factor of the standard uncertainty, for errors that all edges share and no jackknife shows.
-        agreement: standard uncertainties within which two estimates in a row must agree to be believed.
-        frames: which frames are kept.
-        adjustment: of the joint adjustment.
-    """
-
-    min_quality: float = 0.5
-    min_frames: int = 8
-    new_frames: int = 3
-    max_std: float = 0.05
-    sure_std: float = 0.025
-    many_frames: int = 20
-    enough_std: float = 0.006
-    inflation: float = 1.5
-    agreement: float = 2.0
-    frames: FrameSetOptions = field(default_factory=FrameSetOptions)
-    adjustment: AdjustmentOptions = field(default_factory=AdjustmentOptions)
+MIN_QUALITY = 0.5
+"""Quality of a pose below which its frame is not used."""
+MIN_FRAMES = 8
+"""Frames without which nothing is estimated."""
+NEW_FRAMES = 3
+"""Frames that must have been added for a second estimate; each later one takes one more."""
+MAX_STD = 0.05
+"""Relative standard uncertainty above which the focal length counts as undetermined."""
+SURE_STD = 0.025
+"""Relative standard uncertainty above which ``MANY_FRAMES`` are needed as well."""
+MANY_FRAMES = 20
+"""See ``SURE_STD``."""
+ENOUGH_STD = 0.006
+"""Relative standard uncertainty at which more frames are not needed."""
+INFLATION = 1.5
+"""Factor of the standard uncertainty, for errors that all edges share and no jackknife shows."""
+AGREEMENT = 2.0
+"""Standard uncertainties within which two estimates in a row must agree to be believed."""
 
 
 @dataclass(frozen=True)
@@ -88,15 +76,13 @@ class FocalEstimator:
     Args:
         part: the part in the form of the kernels.
         guess: the camera assumed before.
-        options: see `FocalOptions`.
     """
 
-    def __init__(self, part: PartView, guess: Camera, options: FocalOptions | None = None) -> None:
-        self.options = options or FocalOptions()
+    def __init__(self, part: PartView, guess: Camera) -> None:
         self.guess = guess
         self._part = part
-        self._set = FrameSet(guess, self.options.frames)
-        self._adjustment = FocalAdjustment(part, guess, self.options.adjustment)
+        self._set = FrameSet(guess)
+        self._adjustment = FocalAdjustment(part, guess)
         self._added = self._estimates = 0
         self._last: FocalEstimate | None = None
 
@@ -108,13 +94,13 @@ class FocalEstimator:
     @property
     def is_due(self) -> bool:
         """Whether there are enough new frames for another estimate."""
-        return self.frames >= self.options.min_frames and self._added >= self.options.new_frames + self._estimates
+        return self.frames >= MIN_FRAMES and self._added >= NEW_FRAMES + self._estimates
 
     @property
     def is_done(self) -> bool:
         """Whether more frames are not needed."""
         last = self._last
-        return last is not None and last.is_determined and last.std_px <= self.options.enough_std * last.focal_px
+        return last is not None and last.is_determined and last.std_px <= ENOUGH_STD * last.focal_px
 
     def add(self, image: NDArray[np.uint8], pose: Pose, camera: Camera) -> bool:
         """Take in a tracked frame (H,W,3) if it shows something new; returns whether it is kept.
@@ -124,12 +110,12 @@ class FocalEstimator:
             pose: of the part, found with ``camera``.
             camera: the camera with which this frame was tracked.
         """
-        if pose.cam_from_model is None or pose.quality < self.options.min_quality:
+        if pose.cam_from_model is None or pose.quality < MIN_QUALITY:
             return False
         cam_from_body = pose.cam_from_model @ self._part.model_from_body
         if not self._set.is_new(cam_from_body, camera.fx):
             return False
-        frame = cropped_frame(image, cam_from_body, camera, self._part.views.diameter_mm, self.options.frames)
+        frame = cropped_frame(image, cam_from_body, camera, self._part.views.diameter_mm)
         if frame is None:
             return False
         frame.information = self._adjustment.information(frame, camera)
@@ -149,15 +135,14 @@ class FocalEstimator:
         It is determined when it is precise enough, and agrees with the estimate before, which had fewer frames. The
         first estimate is compared with one from two thirds of its frames.
         """
-        o = self.options
         frames = self.take_frames() if frames is None else frames
-        if self._last is None and 2 * len(frames) >= 3 * o.min_frames:
+        if self._last is None and 2 * len(frames) >= 3 * MIN_FRAMES:
             self.estimate(frames[: 2 * len(frames) // 3])
-        found = self._solve(frames) if len(frames) >= o.min_frames else None
-        if found is None or len(found.used) < o.min_frames:
+        found = self._solve(frames) if len(frames) >= MIN_FRAMES else None
+        if found is None or len(found.used) < MIN_FRAMES:
             return FocalEstimate(self.guess, float("inf"), self.guess.fx, len(frames), False)
-        std = o.inflation * found.log_focal_std
-        is_precise = std <= (o.max_std if len(found.used) >= o.many_frames else o.sure_std)
+        std = INFLATION * found.log_focal_std
+        is_precise = std <= (MAX_STD if len(found.used) >= MANY_FRAMES else SURE_STD)
         is_determined = is_precise and self._agrees(found, std)
         estimate = FocalEstimate(found.camera, std * found.camera.fx, self.guess.fx, len(found.used), is_determined)
         self._last = estimate
@@ -175,7 +160,7 @@ class FocalEstimator:
         last = self._last
         if last is None:
             return False
-        limit = self.options.agreement * float(np.hypot(std, last.std_px / last.focal_px))
+        limit = AGREEMENT * float(np.hypot(std, last.std_px / last.focal_px))
         return abs(float(np.log(found.camera.fx / last.focal_px))) <= limit
 
     def _start(self) -> Camera:

@@ -12,28 +12,20 @@ from arview.camera import Camera
 from arview.geometry import Array
 from arview.refinement.modalities.edge import smoothed
 
-
-@dataclass(frozen=True)
-class FrameSetOptions:
-    """Which frames are kept.
-
-    Attributes:
-        max_frames: frames kept at most; of more, those with the least information on the focal length are left out.
-        span_px: a larger part is reduced to this diameter in the kept picture, which bounds memory and time.
-        crop_reach: half side of the kept picture, in half diameters of the part.
-        turn_deg: rotation from all kept frames that makes a frame new.
-        distance_share: change of the distance that makes a frame new.
-        shift_share: shift in the picture, as a share of its longer side, that makes a frame new.
-        min_visible: share of the part's box inside the picture below which a frame is not kept.
-    """
-
-    max_frames: int = 30
-    span_px: float = 400.0
-    crop_reach: float = 1.25
-    turn_deg: float = 4.0
-    distance_share: float = 0.05
-    shift_share: float = 0.08
-    min_visible: float = 0.6
+MAX_FRAMES = 30
+"""Frames kept at most; of more, those with the least information on the focal length are left out."""
+SPAN_PX = 400.0
+"""A larger part is reduced to this diameter in the kept picture, which bounds memory and time."""
+CROP_REACH = 1.25
+"""Half side of the kept picture, in half diameters of the part."""
+TURN_DEG = 4.0
+"""Rotation from all kept frames that makes a frame new."""
+DISTANCE_SHARE = 0.05
+"""Change of the distance that makes a frame new."""
+SHIFT_SHARE = 0.08
+"""Shift in the picture, as a share of its longer side, that makes a frame new."""
+MIN_VISIBLE = 0.6
+"""Share of the part's box inside the picture below which a frame is not kept."""
 
 
 @dataclass(eq=False)
@@ -71,21 +63,20 @@ class CalibrationFrame:
 
 
 def cropped_frame(
-    image: NDArray[np.uint8], cam_from_body: Array, camera: Camera, diameter_mm: float, options: FrameSetOptions
+    image: NDArray[np.uint8], cam_from_body: Array, camera: Camera, diameter_mm: float
 ) -> CalibrationFrame | None:
     """The picture around the part at a pose (4,4) in a frame (H,W,3); None where too little of it is inside."""
-    o = options
     u, v = camera.project(cam_from_body[:3, 3])
     span_px = diameter_mm * camera.fx / max(float(cam_from_body[2, 3]), 1.0)
-    reach = 0.5 * span_px * o.crop_reach
+    reach = 0.5 * span_px * CROP_REACH
     if not np.isfinite(u + v + reach):
         return None
     box = np.array([u - reach, v - reach, u + reach, v + reach])
     inside = np.clip(box, 0, [camera.width, camera.height, camera.width, camera.height])
     sides = np.minimum(2.0 * reach, [camera.width, camera.height])
-    if np.prod(inside[2:] - inside[:2]) < o.min_visible * np.prod(sides):
+    if np.prod(inside[2:] - inside[:2]) < MIN_VISIBLE * np.prod(sides):
         return None
-    scale = min(1.0, o.span_px / span_px)
+    scale = min(1.0, SPAN_PX / span_px)
     x0, y0, x1, y1 = (int(value) for value in (*np.floor(inside[:2]), *np.ceil(inside[2:])))
     gray = cv2.cvtColor(np.ascontiguousarray(image[y0:y1, x0:x1]), cv2.COLOR_RGB2GRAY)
     if scale == 1.0:
@@ -113,11 +104,9 @@ class FrameSet:
 
     Args:
         camera: of the frames, for their size.
-        options: see `FrameSetOptions`.
     """
 
-    def __init__(self, camera: Camera, options: FrameSetOptions | None = None) -> None:
-        self.options = options or FrameSetOptions()
+    def __init__(self, camera: Camera) -> None:
         self.frames: list[CalibrationFrame] = []
         self._longer_px = float(max(camera.width, camera.height))
 
@@ -125,21 +114,21 @@ class FrameSet:
         """Whether a pose (4,4), found with a focal length, differs enough from those of all kept frames."""
         if not self.frames:
             return True
-        o, new = self.options, cam_from_body
+        new = cam_from_body
         kept = np.stack([frame.cam_from_body for frame in self.frames])
         focals_px = np.array([frame.focal_px for frame in self.frames])
         cosines = 0.5 * (np.einsum("nij,ij->n", kept[:, :3, :3], new[:3, :3]) - 1.0)
-        is_turned = cosines < np.cos(np.deg2rad(o.turn_deg))
+        is_turned = cosines < np.cos(np.deg2rad(TURN_DEG))
         # Distances compare per focal length: a frame keeps the pose found with the camera of its time.
         ratios = (kept[:, 2, 3] / focals_px) / (new[2, 3] / focal_px)
-        is_nearer = np.abs(np.log(ratios)) > o.distance_share
+        is_nearer = np.abs(np.log(ratios)) > DISTANCE_SHARE
         places_px = focals_px[:, None] * kept[:, :2, 3] / kept[:, 2:3, 3]
         shifts_px = np.linalg.norm(places_px - focal_px * new[:2, 3] / new[2, 3], axis=1)
-        return bool(np.all(is_turned | is_nearer | (shifts_px > o.shift_share * self._longer_px)))
+        return bool(np.all(is_turned | is_nearer | (shifts_px > SHIFT_SHARE * self._longer_px)))
 
     def add(self, frame: CalibrationFrame) -> bool:
         """Keep a frame; of too many, the least informative one is left out. Returns whether the set has changed."""
-        if len(self.frames) >= self.options.max_frames:
+        if len(self.frames) >= MAX_FRAMES:
             least = min(self.frames, key=lambda kept: kept.information)
             if least.information >= frame.information:
                 return False

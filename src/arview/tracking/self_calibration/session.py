@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor, wait
-from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,30 +18,17 @@ from arview.guideviews import GuideViewSet
 from arview.pose import Pose, TrackingState
 from arview.refinement.view_model import PartView
 from arview.tracking.identity import IdentityMonitor
-from arview.tracking.self_calibration.estimator import FocalEstimate, FocalEstimator, FocalOptions, pose_seen_by
+from arview.tracking.self_calibration.estimator import FocalEstimate, FocalEstimator, pose_seen_by
 from arview.tracking.session import TrackingSession
 
 MakeSession = Callable[[Camera, Array | None], TrackingSession]
 """Makes a session from a camera and, where tracking goes on, the pose (4,4) in its first frame."""
 
 
-@dataclass(frozen=True)
-class SelfCalibrationOptions:
-    """When the camera of a session is replaced.
-
-    Attributes:
-        min_change: standard uncertainties by which an estimate must differ from the camera in use to replace it.
-        max_replacements: how often the camera is replaced at most.
-        max_first_pass: frames of the first pass over a film at most.
-        max_idle_frames: frames without a new view after which the first pass ends.
-        focal: of the estimation.
-    """
-
-    min_change: float = 1.0
-    max_replacements: int = 3
-    max_first_pass: int = 900
-    max_idle_frames: int = 240
-    focal: FocalOptions = field(default_factory=FocalOptions)
+MIN_CHANGE = 1.0
+"""Standard uncertainties by which an estimate must differ from the camera in use to replace it."""
+MAX_REPLACEMENTS = 3
+"""How often the camera is replaced at most."""
 
 
 class SelfCalibratingSession:
@@ -54,7 +40,6 @@ class SelfCalibratingSession:
         make_session: makes the sessions, see `MakeSession`.
         views: guide views of the part.
         guess: the camera to begin with.
-        options: see `SelfCalibrationOptions`.
 
     Attributes:
         session: the tracking session in use.
@@ -66,14 +51,12 @@ class SelfCalibratingSession:
         make_session: MakeSession,
         views: GuideViewSet,
         guess: Camera,
-        options: SelfCalibrationOptions | None = None,
     ) -> None:
-        self.options = options or SelfCalibrationOptions()
         self.session = make_session(guess, None)
         self.estimate: FocalEstimate | None = None
         self._make_session = make_session
         self._part = PartView(views)
-        self._estimator = FocalEstimator(self._part, guess, self.options.focal)
+        self._estimator = FocalEstimator(self._part, guess)
         self._cameras: list[tuple[int, Camera]] = [(0, guess)]
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="arview-focal")
         self._pending: Future[FocalEstimate] | None = None
@@ -152,12 +135,11 @@ class SelfCalibratingSession:
 
     def _finished(self, is_waiting: bool = False) -> FocalEstimate | None:
         """A new estimate that calls for another camera; None without one."""
-        o = self.options
         if self._pending is None or not (is_waiting or self._pending.done()):
             return None
         estimate, self._pending = self._pending.result(), None
         self.estimate = estimate
-        if not estimate.is_determined or len(self._cameras) > o.max_replacements:
+        if not estimate.is_determined or len(self._cameras) > MAX_REPLACEMENTS:
             return None
         change_px = abs(estimate.focal_px - self.camera.fx)
-        return estimate if change_px > o.min_change * estimate.std_px else None
+        return estimate if change_px > MIN_CHANGE * estimate.std_px else None

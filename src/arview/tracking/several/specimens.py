@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import cv2
@@ -15,27 +14,16 @@ from arview.camera import Camera
 from arview.geometry import Array, apply
 from arview.guideviews import GuideViewSet
 
-
-@dataclass(frozen=True)
-class SpecimenOptions:
-    """When poses are of one specimen, and how a specimen is hidden.
-
-    Attributes:
-        same_place: distance of the centres, in diameters of the part, within which two specimens are one.
-        margin: share by which the area that hides a specimen is larger than the specimen.
-        near_share: depth, in diameters, below which points are left out because they may be behind the camera.
-        work_px: longer side of the reduced picture in which the surroundings are spread into the area.
-        soft_px: standard deviation with which the border of the area is blurred.
-    """
-
-    same_place: float = 0.3
-    margin: float = 0.06
-    near_share: float = 0.1
-    work_px: int = 160
-    soft_px: float = 2.0
-
-
-DEFAULT = SpecimenOptions()
+SAME_PLACE = 0.3
+"""Distance of the centres, in diameters of the part, within which two specimens are one."""
+MARGIN = 0.06
+"""Share by which the area that hides a specimen is larger than the specimen."""
+NEAR_SHARE = 0.1
+"""Depth, in diameters, below which points are left out because they may be behind the camera."""
+WORK_PX = 160
+"""Longer side of the reduced picture in which the surroundings are spread into the area."""
+SOFT_PX = 2.0
+"""Standard deviation with which the border of the area is blurred."""
 
 
 class CoveredPlace(NamedTuple):
@@ -55,10 +43,10 @@ def specimen_names(part_names: Sequence[str]) -> list[str]:
     return names
 
 
-def is_same_specimen(one: Array, other: Array, views: GuideViewSet, options: SpecimenOptions = DEFAULT) -> bool:
+def is_same_specimen(one: Array, other: Array, views: GuideViewSet) -> bool:
     """Whether the centre of a part is at about the same place at two poses (4,4)."""
     apart = apply(one, views.center_in_model) - apply(other, views.center_in_model)
-    return bool(np.linalg.norm(apart) < options.same_place * views.diameter_mm)
+    return bool(np.linalg.norm(apart) < SAME_PLACE * views.diameter_mm)
 
 
 def hide_specimens(
@@ -66,7 +54,6 @@ def hide_specimens(
     poses: Sequence[Array],
     views: GuideViewSet,
     camera: Camera,
-    options: SpecimenOptions = DEFAULT,
 ) -> NDArray[np.uint8]:
     """A picture in which a part is covered by its surroundings at some poses, so that others of its kind are found.
 
@@ -78,7 +65,6 @@ def hide_specimens(
         poses: (4,4) of specimens that are not to be found again.
         views: of the part.
         camera: of the image.
-        options: see `SpecimenOptions`.
 
     Returns:
         (H,W,3) uint8; the image itself where no specimen is in it.
@@ -86,20 +72,20 @@ def hide_specimens(
     covered = np.zeros(image.shape[:2], dtype=np.uint8)
     for pose in poses:
         outline = views.nearest(pose).features.contour_points
-        points = apply(pose, views.center_in_model + (1.0 + options.margin) * (outline - views.center_in_model))
-        pixels = camera.project(points[points[:, 2] > options.near_share * views.diameter_mm])
+        points = apply(pose, views.center_in_model + (1.0 + MARGIN) * (outline - views.center_in_model))
+        pixels = camera.project(points[points[:, 2] > NEAR_SHARE * views.diameter_mm])
         pixels = pixels[np.isfinite(pixels).all(axis=1)]
         if len(pixels) >= 3:
             hull = cv2.convexHull(np.clip(pixels, -1e4, 1e4).astype(np.float32))
             cv2.fillConvexPoly(covered, np.round(hull).astype(np.int32), 255)
     if not covered.any():
         return image
-    size, scale = image.shape[1::-1], min(1.0, options.work_px / max(image.shape[:2]))
+    size, scale = image.shape[1::-1], min(1.0, WORK_PX / max(image.shape[:2]))
     small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     is_covered = cv2.resize(covered, small.shape[1::-1], interpolation=cv2.INTER_AREA) > 0
     area = cv2.dilate(is_covered.astype(np.uint8), np.ones((3, 3), np.uint8))
     spread = cv2.resize(cv2.inpaint(small, area, 3, cv2.INPAINT_TELEA), size, interpolation=cv2.INTER_LINEAR)
-    share = (cv2.GaussianBlur(covered, (0, 0), options.soft_px).astype(np.float32) / 255.0)[..., None]
+    share = (cv2.GaussianBlur(covered, (0, 0), SOFT_PX).astype(np.float32) / 255.0)[..., None]
     return np.asarray(np.round((1.0 - share) * image + share * spread), dtype=np.uint8)
 
 

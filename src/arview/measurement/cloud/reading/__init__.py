@@ -1,7 +1,7 @@
 """Reading clouds of scanners and other programs: PLY, PCD, XYZ, PTS, CSV, LAS, LAZ and E57."""
 
 from arview.measurement.cloud.reading.files import SUFFIXES, read_points
-from arview.measurement.cloud.reading.raw_points import RawPoints, ReadOptions
+from arview.measurement.cloud.reading.raw_points import RawPoints
 from arview.measurement.cloud.reading.units import (
     UNITS_MM,
     USUAL_UNITS,
@@ -11,6 +11,12 @@ from arview.measurement.cloud.reading.units import (
 )
 
 __all__ = [
-    "SUFFIXES", "UNITS_MM", "USUAL_UNITS", "RawPoints", "ReadOptions", "check_given_unit", "possible_units",
-    "read_points", "unit_of_option",
-]  # fmt: skip
+    "SUFFIXES",
+    "UNITS_MM",
+    "USUAL_UNITS",
+    "RawPoints",
+    "check_given_unit",
+    "possible_units",
+    "read_points",
+    "unit_of_option",
+]

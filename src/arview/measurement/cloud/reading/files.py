@@ -16,8 +16,13 @@ import numpy as np
 from arview.core.extras import load, require
 from arview.errors import ArviewError, InputError
 from arview.measurement.cloud.open3d_library import load_open3d
-from arview.measurement.cloud.reading.raw_points import PointCollector, RawPoints, ReadOptions, check_count
-from arview.measurement.cloud.reading.text import read_text
+from arview.measurement.cloud.reading.raw_points import PointCollector, RawPoints, check_count
+from arview.measurement.cloud.reading.text import BLOCK_BYTES, read_text
+
+MAX_HEADER_BYTES = 65_536
+"""Length of the header of a PLY or PCD file."""
+CHUNK_POINTS = 2_000_000
+"""Points of a LAS file that are decoded at a time."""
 
 _SIZES = {
     **dict.fromkeys(("char", "uchar", "int8", "uint8"), 1),
@@ -28,17 +33,16 @@ _SIZES = {
 """Bytes of the types of PLY properties."""
 
 
-def read_points(path: str | Path, options: ReadOptions | None = None) -> RawPoints:
+def read_points(path: str | Path) -> RawPoints:
     """Read a cloud in its own unit.
 
     Args:
         path: PLY, PCD, XYZ, PTS, CSV, TXT, ASC, LAS, LAZ or E57; known by its first bytes, else by its suffix.
-        options: limits.
 
     Raises:
         InputError: the file cannot be read, is of another format, is damaged, or holds no points.
     """
-    o, path = options or ReadOptions(), Path(path)
+    path = Path(path)
     if not path.is_file():
         raise InputError(f"{path}: no such file; give a cloud ({', '.join(SUFFIXES)})")
     try:
@@ -50,18 +54,18 @@ def read_points(path: str | Path, options: ReadOptions | None = None) -> RawPoin
         raise InputError(f"{path}: is empty")
     for magic, read in ((b"ply", _read_ply), (b"LASF", _read_las), (b"ASTM-E57", _read_e57)):
         if start.startswith(magic):
-            return read(path, o)
+            return read(path)
     read_suffix = SUFFIXES.get(path.suffix.lower())
     if read_suffix is None:
         raise InputError(f"{path}: is no known format of a cloud; expected {', '.join(SUFFIXES)}")
     if read_suffix in (_read_ply, _read_las, _read_e57):
         raise InputError(f"{path}: is not a {path.suffix[1:].upper()} file with points")
-    return read_suffix(path, o)
+    return read_suffix(path)
 
 
-def _read_ply(path: Path, o: ReadOptions) -> RawPoints:
+def _read_ply(path: Path) -> RawPoints:
     """A PLY file by Open3D, after its header was checked."""
-    header = _header(path, b"end_header", o)
+    header = _header(path, b"end_header")
     size = path.stat().st_size - len(header)
     kind, count, element, record, names = "", -1, "", 0, []
     for words in (line.split() for line in header.splitlines()):
@@ -77,18 +81,18 @@ def _read_ply(path: Path, o: ReadOptions) -> RawPoints:
             names.append(words[2])
     if count < 0 or not {"x", "y", "z"} <= set(names) or not kind:
         raise InputError(f"{path}: is not a PLY file with points")
-    check_count(path, count, o)
+    check_count(path, count)
     least = 2 * len(names) if kind == "ascii" else record
     if count * least > size:
         raise InputError(f"{path}: is truncated: its header names {count} points, {size} bytes follow")
     if kind == "ascii":
-        _check_lines(path, count, o)
-    return _by_open3d(path, count, o)
+        _check_lines(path, count)
+    return _by_open3d(path, count)
 
 
-def _read_pcd(path: Path, o: ReadOptions) -> RawPoints:
+def _read_pcd(path: Path) -> RawPoints:
     """A PCD file by Open3D, after its header was checked."""
-    header = _header(path, b"DATA ", o)
+    header = _header(path, b"DATA ")
     fields = {words[0].upper(): words[1:] for words in map(str.split, header.splitlines()) if words}
     if "FIELDS" not in fields or not {"x", "y", "z"} <= set(fields["FIELDS"]):
         raise InputError(f"{path}: is not a PCD file with the fields x y z")
@@ -97,7 +101,7 @@ def _read_pcd(path: Path, o: ReadOptions) -> RawPoints:
     repeats = [_integer(path, word) for word in fields.get("COUNT", ["1"] * len(sizes))]
     if len(sizes) != len(fields["FIELDS"]) or len(repeats) != len(sizes):
         raise InputError(f"{path}: its PCD header is damaged")
-    check_count(path, count, o)
+    check_count(path, count)
     kind, size = (fields.get("DATA") or [""])[0], path.stat().st_size - len(header)
     record = sum(a * b for a, b in zip(sizes, repeats, strict=True))
     least = {"ascii": 2 * sum(repeats), "binary": record}.get(kind, 0)
@@ -112,21 +116,21 @@ def _read_pcd(path: Path, o: ReadOptions) -> RawPoints:
     if count * least > size:
         raise InputError(f"{path}: is truncated: its header names {count} points, {size} bytes follow")
     if kind == "ascii":
-        _check_lines(path, count, o)
-    return _by_open3d(path, count, o)
+        _check_lines(path, count)
+    return _by_open3d(path, count)
 
 
-def _check_lines(path: Path, count: int, o: ReadOptions) -> None:
+def _check_lines(path: Path, count: int) -> None:
     """Raise InputError when a text file has fewer lines than points: the reader would fill up with zeros."""
     lines = 0
     with path.open("rb") as file:
-        while block := file.read(o.block_bytes):
+        while block := file.read(BLOCK_BYTES):
             lines += block.count(b"\n")
     if lines < count:
         raise InputError(f"{path}: is truncated: its header names {count} points, and it has {lines} lines")
 
 
-def _by_open3d(path: Path, count: int, o: ReadOptions) -> RawPoints:
+def _by_open3d(path: Path, count: int) -> RawPoints:
     """Points and normals of a file whose header was checked, as Open3D reads them."""
     o3d = load_open3d()
     try:
@@ -139,33 +143,33 @@ def _by_open3d(path: Path, count: int, o: ReadOptions) -> RawPoints:
         raise InputError(f"{path}: is not a {path.suffix[1:].upper()} file with points ({reason})") from error
     if len(points) != count:
         raise InputError(f"{path}: is truncated: its header names {count} points, {len(points)} could be read")
-    collector = PointCollector(path, o)
-    for start in range(0, len(points), o.chunk_points):
-        part = slice(start, start + o.chunk_points)
+    collector = PointCollector(path)
+    for start in range(0, len(points), CHUNK_POINTS):
+        part = slice(start, start + CHUNK_POINTS)
         collector.add(points[part], None if normals is None else normals[part])
     del cloud, points, normals
     return collector.result()
 
 
-def _read_las(path: Path, o: ReadOptions) -> RawPoints:
+def _read_las(path: Path) -> RawPoints:
     """A LAS or LAZ file by laspy."""
     with _library("laspy", "lazrs", path=path, kind="LAS") as (laspy, _):
         with laspy.open(path) as reader:
-            check_count(path, int(reader.header.point_count), o)
-            collector = PointCollector(path, o)
-            for points in reader.chunk_iterator(o.chunk_points):
+            check_count(path, int(reader.header.point_count))
+            collector = PointCollector(path)
+            for points in reader.chunk_iterator(CHUNK_POINTS):
                 collector.add(np.stack([np.asarray(points.x), np.asarray(points.y), np.asarray(points.z)], axis=1))
         return collector.result()
 
 
-def _read_e57(path: Path, o: ReadOptions) -> RawPoints:
+def _read_e57(path: Path) -> RawPoints:
     """All scans of an E57 file by pye57, in their common frame."""
     with _library("pye57", path=path, kind="E57") as (pye57,):
-        collector = PointCollector(path, o)
+        collector = PointCollector(path)
         file = pye57.E57(str(path))
         try:
             count = sum(int(file.get_header(index).point_count) for index in range(file.scan_count))
-            check_count(path, count, o)
+            check_count(path, count)
             if count > 8 * path.stat().st_size:
                 raise InputError(f"{path}: is truncated: its header names {count} points")
             for index in range(file.scan_count):
@@ -190,11 +194,11 @@ def _library(*names: str, path: Path, kind: str) -> Iterator[tuple[Any, ...]]:
         raise InputError(f"{path}: is not a {kind} file with points, or damaged ({reason})") from error
 
 
-def _header(path: Path, last: bytes, o: ReadOptions) -> str:
+def _header(path: Path, last: bytes) -> str:
     """Text up to the line that begins with ``last``. Raises InputError when there is none."""
     try:
         with path.open("rb") as file:
-            start = file.read(o.max_header_bytes)
+            start = file.read(MAX_HEADER_BYTES)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
     place = start.find(b"\n" + last)
@@ -211,7 +215,7 @@ def _integer(path: Path, word: str) -> int:
     return int(word)
 
 
-SUFFIXES: dict[str, Callable[[Path, ReadOptions], RawPoints]] = {
+SUFFIXES: dict[str, Callable[[Path], RawPoints]] = {
     ".ply": _read_ply,
     ".pcd": _read_pcd,
     ".xyz": read_text,

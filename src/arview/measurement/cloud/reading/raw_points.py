@@ -11,20 +11,10 @@ from numpy.typing import NDArray
 from arview.errors import InputError
 from arview.geometry import Array
 
-
-@dataclass(frozen=True)
-class ReadOptions:
-    """Limits of reading; they keep damaged or hostile files from filling the memory."""
-
-    max_coordinate: float = 1e12  # largest coordinate in the file's unit; others stand for points that are not there
-    max_points: int = 100_000_000  # points of a file; more are refused, with advice to thin them
-    max_header_bytes: int = 65_536  # length of the header of a PLY or PCD file
-    max_columns: int = 64  # numbers in a line of a text file
-    max_header_lines: int = 200  # lines before the first point of a text file
-    max_bad_share: float = 0.01  # share of lines of a text file that may be unreadable
-    min_bad_lines: int = 10  # unreadable lines that are tolerated in any text file
-    block_bytes: int = 16_000_000  # part of a text file that is parsed at a time
-    chunk_points: int = 2_000_000  # points of a LAS file that are decoded at a time
+MAX_COORDINATE = 1e12
+"""Largest coordinate in the file's unit; others stand for points that are not there."""
+MAX_POINTS = 100_000_000
+"""Points of a file; more are refused, with advice to thin them."""
 
 
 @dataclass(frozen=True)
@@ -53,8 +43,8 @@ class RawPoints:
 class PointCollector:
     """Gathers chunks of points in single precision relative to the first one."""
 
-    def __init__(self, path: Path, options: ReadOptions) -> None:
-        self._path, self._options = path, options
+    def __init__(self, path: Path) -> None:
+        self._path = path
         self._origin: Array | None = None
         self._points: list[NDArray[np.float32]] = []
         self._normals: list[NDArray[np.float32]] = []
@@ -62,7 +52,7 @@ class PointCollector:
 
     def add(self, points: NDArray[np.floating], normals: NDArray[np.floating] | None = None) -> None:
         """Add points (N,3) with their normals, if the file has any. Raises InputError above the limit."""
-        finite = (np.abs(points) <= self._options.max_coordinate).all(axis=1)
+        finite = (np.abs(points) <= MAX_COORDINATE).all(axis=1)
         if not finite.all():
             self._broken += int(np.count_nonzero(~finite))
             points = points[finite]
@@ -70,7 +60,7 @@ class PointCollector:
         if len(points) == 0:
             return
         self._count += len(points)
-        check_count(self._path, self._count, self._options)
+        check_count(self._path, self._count)
         if self._origin is None:
             self._origin = np.asarray(points[0], dtype=np.float64)
         self._points.append((points - self._origin.astype(points.dtype)).astype(np.float32))
@@ -90,7 +80,7 @@ class PointCollector:
         return replace(raw, notes=notes)
 
 
-def check_count(path: Path, count: int, options: ReadOptions) -> None:
+def check_count(path: Path, count: int) -> None:
     """Raise InputError when a file holds more points than are read."""
-    if count > options.max_points:
-        raise InputError(f"{path}: holds {count} points; at most {options.max_points} are read: thin it first")
+    if count > MAX_POINTS:
+        raise InputError(f"{path}: holds {count} points; at most {MAX_POINTS} are read: thin it first")

@@ -18,7 +18,18 @@ from numpy.typing import NDArray
 
 from arview.errors import InputError
 from arview.geometry import Array
-from arview.measurement.cloud.reading.raw_points import PointCollector, RawPoints, ReadOptions
+from arview.measurement.cloud.reading.raw_points import PointCollector, RawPoints
+
+MAX_COLUMNS = 64
+"""Numbers in a line of a text file."""
+MAX_HEADER_LINES = 200
+"""Lines before the first point of a text file."""
+MAX_BAD_SHARE = 0.01
+"""Share of lines of a text file that may be unreadable."""
+MIN_BAD_LINES = 10
+"""Unreadable lines that are tolerated in any text file."""
+BLOCK_BYTES = 16_000_000
+"""Part of a text file that is parsed at a time."""
 
 _SNIFFED_BYTES = 65_536
 """Beginning of a file from which its layout is found."""
@@ -51,14 +62,13 @@ class _Layout:
     declared: int = 0
 
 
-def read_text(path: Path, options: ReadOptions | None = None) -> RawPoints:
+def read_text(path: Path) -> RawPoints:
     """Read the points of a text file.
 
     Raises:
         InputError: the file cannot be read, is not text, has no columns of coordinates, too many damaged lines, or
             fewer lines than its header names.
     """
-    o = options or ReadOptions()
     try:
         with path.open("rb") as file:
             start = file.read(_SNIFFED_BYTES)
@@ -66,19 +76,19 @@ def read_text(path: Path, options: ReadOptions | None = None) -> RawPoints:
                 raise InputError(f"{path}: is UTF-16; save it as UTF-8")
             if b"\0" in start:
                 raise InputError(f"{path}: is not a text file")
-            layout = _layout(path, start.removeprefix(b"\xef\xbb\xbf"), o)
+            layout = _layout(path, start.removeprefix(b"\xef\xbb\xbf"))
             file.seek(3 if start[:3] == b"\xef\xbb\xbf" else 0)
-            return _read(path, file, layout, o)
+            return _read(path, file, layout)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
 
 
-def _read(path: Path, file: BinaryIO, layout: _Layout, o: ReadOptions) -> RawPoints:
+def _read(path: Path, file: BinaryIO, layout: _Layout) -> RawPoints:
     """All points of an open file."""
-    collector = PointCollector(path, o)
+    collector = PointCollector(path)
     lines = bad = 0
     first_bad = ""
-    for block in _blocks(path, file, layout, o):
+    for block in _blocks(path, file, layout):
         values = _parse_block(block, layout.columns)
         if values is None:
             values, wrong, text = _parse_lines(block, layout.columns)
@@ -86,7 +96,7 @@ def _read(path: Path, file: BinaryIO, layout: _Layout, o: ReadOptions) -> RawPoi
             bad += wrong
             lines += wrong
         lines += len(values)
-        if bad > max(o.min_bad_lines, o.max_bad_share * lines):
+        if bad > max(MIN_BAD_LINES, MAX_BAD_SHARE * lines):
             raise InputError(
                 f"{path}: {bad} of its first {lines} lines do not hold {layout.columns} numbers, as {first_bad!r}"
             )
@@ -97,13 +107,13 @@ def _read(path: Path, file: BinaryIO, layout: _Layout, o: ReadOptions) -> RawPoi
     return collector.result(layout.unit, (f"{bad} unreadable lines were left out",) if bad else ())
 
 
-def _blocks(path: Path, file: BinaryIO, layout: _Layout, o: ReadOptions) -> Iterator[bytes]:
+def _blocks(path: Path, file: BinaryIO, layout: _Layout) -> Iterator[bytes]:
     """The lines after the header in blocks, with spaces as separators and decimal points."""
     for _ in range(layout.skipped):
         file.readline(_MAX_LINE)
     rest = b""
     while True:
-        read = file.read(o.block_bytes)
+        read = file.read(BLOCK_BYTES)
         block = rest + read
         if not read:  # what is left is the last line
             if len(block) > _MAX_LINE:
@@ -165,13 +175,13 @@ def _parse_lines(block: bytes, columns: int) -> tuple[Array, int, str]:
     return np.array(rows, dtype=np.float64).reshape(-1, columns), bad, text
 
 
-def _layout(path: Path, start: bytes, o: ReadOptions) -> _Layout:
+def _layout(path: Path, start: bytes) -> _Layout:
     """Separators, columns and header of a file from its first lines."""
     text = start.decode("latin-1")
     lines = re.split(r"\r\n|\n|\r", text)
     lines = lines[:-1] if len(start) >= _SNIFFED_BYTES else lines
     header: list[str] = []
-    for index, line in enumerate(lines[: o.max_header_lines]):
+    for index, line in enumerate(lines[:MAX_HEADER_LINES]):
         rows = [row for row in lines[index : index + 40] if row.strip()]
         marks = _marks(rows)
         if len(_numbers(line, marks)) >= 3:
@@ -181,8 +191,8 @@ def _layout(path: Path, start: bytes, o: ReadOptions) -> _Layout:
         raise InputError(f"{path}: no line with three numbers was found in its first {len(header) or 1} lines")
     rows_of = [_numbers(row, marks) for row in rows]
     columns = len(rows_of[0])
-    if columns > o.max_columns:
-        raise InputError(f"{path}: {columns} numbers in a line; at most {o.max_columns} are read")
+    if columns > MAX_COLUMNS:
+        raise InputError(f"{path}: {columns} numbers in a line; at most {MAX_COLUMNS} are read")
     table = bytearray(range(256))
     for mark in ";\t|\r":
         table[ord(mark)] = ord("\n") if mark == "\r" else 32
@@ -226,9 +236,7 @@ def _names(line: str) -> list[str]:
     return [name.strip(" \"'").lower() for name in re.split(r"[,;\t|]|\s+", line) if name.strip(" \"'")]
 
 
-def _columns_by_name(
-    names: list[str], columns: int
-) -> tuple[tuple[int, int, int], tuple[int, int, int] | None]:  # fmt: skip
+def _columns_by_name(names: list[str], columns: int) -> tuple[tuple[int, int, int], tuple[int, int, int] | None]:
     """Columns of x y z and of the normal by their names."""
 
     def places(wanted: tuple[str, ...]) -> tuple[int, int, int] | None:

@@ -1,7 +1,0 @@
-"""Guided capture: from where the next photo of a part should be taken, and when the camera is there and still."""
-
-from arview.capture.advice import CaptureAdvice, CellState, ComponentNeed, capture_document
-from arview.capture.guide import CaptureGuide
-from arview.capture.options import CaptureOptions
-
-__all__ = ["CaptureAdvice", "CaptureGuide", "CaptureOptions", "CellState", "ComponentNeed", "capture_document"]

@@ -1,0 +1,1 @@
+"""The quality office: history of measurements, decisions by people, rework and batches of inspections."""

@@ -1,0 +1,1 @@
+"""Batches of inspections, on one machine or a Dask cluster."""

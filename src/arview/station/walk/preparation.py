@@ -1,0 +1,109 @@
+"""What is found in photos as soon as they arrive: checks, features, matches of pairs; all of it is taken up later."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from threading import Event, Thread
+
+from arview.errors import ArviewError
+from arview.geometry import Array
+from arview.reconstruction.intake.kept import kept
+from arview.reconstruction.intake.photos import read_and_check
+from arview.reconstruction.intake.reading import read_photo
+from arview.reconstruction.memory import SparseMemory
+from arview.reconstruction.pairs import KnownPairs
+from arview.reconstruction.run import reconstruct
+from arview.reconstruction.sparse import match_by_appearance, moving_features
+from arview.reconstruction.still import MAX_SHIFT_PX
+from arview.reconstruction.types import Photo
+from arview.station.walk.job import JobFolder
+from arview.station.walk.records import StoredPhoto
+from arview.workflow.prepare import Prepared
+
+
+@dataclass
+class PhotoPreparation:
+    """A thread that works on each photo when it arrives.
+
+    Attributes:
+        job: the job.
+        prepared: its inputs.
+        memory: where features and matches are kept.
+        threads: photos or pairs at a time.
+        also: what else is done with the usable photos.
+        ready: number of photos that are worked on, in their order.
+    """
+
+    job: JobFolder
+    prepared: Prepared
+    memory: SparseMemory
+    threads: int
+    also: Callable[[Sequence[Photo]], None]
+    ready: int = 0
+    _ends: Event = field(default_factory=Event)
+    _thread: Thread | None = None
+
+    def start(self) -> None:
+        """Start the thread."""
+        self._thread = Thread(target=self._run, name="preparation", daemon=True)
+        self._thread.start()
+
+    def end(self) -> None:
+        """Let the thread finish the photo it works on, and wait for it."""
+        self._ends.set()
+        if self._thread is not None:
+            self._thread.join()
+
+    def _run(self) -> None:
+        while not self._ends.is_set():
+            photos = self.job.photos()
+            if len(photos) > self.ready:
+                self._work(photos[: self.ready + 1])
+                self.ready += 1
+            else:
+                self._ends.wait(0.1)
+
+    def _work(self, photos: Sequence[StoredPhoto]) -> None:
+        """Check the last of the photos, find its features, and match it with those before."""
+        paths = [self.job.path / "photos" / photo.name for photo in photos]
+        newest = paths[-1]
+        options = replace(self.prepared.reconstruct, last_stage="photos")
+        try:
+            read_and_check(newest, newest.name)
+            kept("picture", newest, lambda: read_photo(newest))
+            intake = reconstruct(
+                paths, self.job.path / "rough" / "photos", None, self.prepared.job.camera, options
+            ).intake
+            sparse = options.sparse
+            features, remarks = moving_features(intake.photos, sparse, self.threads, _nothing, self.memory)
+            min_move_px = MAX_SHIFT_PX if remarks else 0.0
+            known = KnownPairs(poses=poses_of(photos))
+            match_by_appearance(
+                intake.photos,
+                features,
+                sparse,
+                threads=self.threads,
+                tell=_nothing,
+                min_move_px=min_move_px,
+                known=known,
+                memory=self.memory,
+            )
+            self.also(intake.photos)
+        except ArviewError:
+            return  # photos that cannot be used are told of when all of them are there
+
+
+def poses_of(photos: Sequence[StoredPhoto]) -> Mapping[str, Array]:
+    """Rough ``cam_from_model`` of the photos that have one, by name."""
+    return {photo.name: pose for photo in photos if (pose := photo.cam_from_model) is not None}
+
+
+def photo_files(job: JobFolder, photos: Sequence[StoredPhoto]) -> list[Path]:
+    """Paths of the photos' files."""
+    return [job.path / "photos" / photo.name for photo in photos]
+
+
+def _nothing(what: str, done: int, total: int) -> None:
+    """Progress that nobody waits for."""
