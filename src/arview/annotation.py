@@ -21,8 +21,7 @@ from arview.core.checks import check_type
 from arview.errors import OutputError, is_interruption
 from arview.pose import Completeness, Pose, Presence
 from arview.pose_file import PoseWriter
-from arview.tracking.self_calibration.estimator import FocalEstimate
-from arview.tracking.self_calibration.session import SelfCalibratingSession
+from arview.tracking import FocalEstimate, SelfCalibratingSession
 from arview.video import Frame, FrameSource, Image
 
 MAX_FIRST_PASS = 900

@@ -65,7 +65,7 @@ def options(**more: Any) -> LiveOptions:
     usual: dict[str, Any] = {
         "camera": str(CAMERA), "inspections": (INSPECTION,), "width": WIDTH, "height": HEIGHT,
         "requests": RequestLimits(
-            per_s=1e6, burst=1e6, strangers_per_s=1e6, strangers_burst=1e6, joins_per_s=1e6, joins_burst=1e6
+            per_s=1e6, burst=1e6, unauthenticated_per_s=1e6, unauthenticated_burst=1e6, joins_per_s=1e6, joins_burst=1e6
         ),
     }  # fmt: skip
     if "inspection" in more:

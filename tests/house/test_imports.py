@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+from importlib import import_module
 from pathlib import Path
 
 from helpers.source_tree import imports, lab_files, modules, source_files, tree
@@ -72,6 +73,40 @@ def test_no_room_imports_one_that_is_not_above_it() -> None:
     assert len(crossings) > 300
     upwards = {f"{name} imports {other}" for name, other in crossings if LEVEL[room(other)] >= LEVEL[room(name)]}
     assert upwards == set()
+
+
+SHELVES = {"errors", "version", "geometry", "pose", "pose_file", "annotation", "core", "web", "weights"}
+"""Single modules, and rooms that are shelves of small modules: their modules are imported by name."""
+
+
+def test_rooms_are_entered_by_their_doors() -> None:
+    """A module of another room is imported by name only for a function that is called like its module."""
+    past_the_door, through = [], 0
+    for name, path in modules().items():
+        for node in ast.walk(tree(path)):
+            if not (isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("arview.")):
+                continue
+            for alias in node.names:
+                full = f"{node.module}.{alias.name}"
+                taken = full if full in modules() else node.module
+                if name in FRONT or taken in FRONT or room(taken) in {room(name), *SHELVES}:
+                    continue
+                is_door = taken == f"arview.{room(taken)}"
+                through += is_door
+                if not is_door and alias.name != taken.rpartition(".")[2]:
+                    past_the_door.append(f"{name}: {full}")
+    assert through > 400
+    assert past_the_door == []
+
+
+def test_doors_offer_what_they_say() -> None:
+    doors = [
+        name for name in modules() if name == f"arview.{room(name)}" and room(name) not in {*SHELVES, "cli", "__main__"}
+    ]
+    assert len(doors) > 20
+    for name in doors:
+        door = import_module(name)
+        assert door.__all__ and all(hasattr(door, offered) for offered in door.__all__), name
 
 
 def test_no_room_imports_the_front() -> None:

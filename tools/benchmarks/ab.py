@@ -202,7 +202,7 @@ def import_detector() -> Any:
     try:
         from arview.detection import Detector
     except ImportError:  # trees from before detection had a room of its own
-        from arview.tracking import Detector  # type: ignore[attr-defined, no-redef]
+        from arview.tracking import Detector  # type: ignore[no-redef]
     return Detector
 
 

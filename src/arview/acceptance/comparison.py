@@ -16,7 +16,7 @@ import numpy as np
 
 from arview.acceptance.lengths import K
 from arview.acceptance.position_list import ListedComponent
-from arview.cad.model import Model
+from arview.cad import Model
 from arview.errors import InputError
 from arview.geometry import Array
 from arview.inspection import ComponentDeviation, Finding, Inspection
@@ -109,7 +109,7 @@ def compare(
     return Comparison(label, tuple(found), left_out)
 
 
-def record_of(comparison: Comparison) -> dict[str, Any]:
+def comparison_record(comparison: Comparison) -> dict[str, Any]:
     """The comparison as JSON values."""
     return {
         "list": comparison.label,

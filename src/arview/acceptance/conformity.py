@@ -13,7 +13,7 @@ import numpy as np
 from arview.acceptance.lengths import K, KnownLength, MeasuredMarks, covariance_of_lengths
 from arview.errors import InputError
 from arview.inspection import Verdict
-from arview.measurement.uncertainty.decision import decide
+from arview.measurement import decide
 
 FULL_TEST = 35
 """Number of lengths that VDI/VDE 2634 part 1 requires: seven measuring lines with five lengths each."""

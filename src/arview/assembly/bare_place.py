@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from arview.assembly.edge_support import FoundPoints
 from arview.geometry import Array
-from arview.guideviews.surface import Surface, draw_surface
-from arview.refinement.projection import project
+from arview.guideviews import Surface, draw_surface
+from arview.refinement import project
 
 BORDER_PX = 2
 """Pixels this near to a drawn edge are not compared, because the pose is not exact."""

@@ -27,7 +27,7 @@ from arview.assembly.image_edges import (
 from arview.assembly.visible_edges import VisibleEdges
 from arview.core.kernel import kernel
 from arview.geometry import Array
-from arview.refinement.projection import project_lines
+from arview.refinement import project_lines
 
 HALF_SCORE_STRENGTH = 20.0
 """Edge strength, in half grey levels per px, that scores half of what the strongest edge scores."""

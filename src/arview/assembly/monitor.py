@@ -20,12 +20,12 @@ from arview.assembly.monitor_state import MonitorState
 from arview.assembly.observation import ComponentObserver, Known, Observation, base_of
 from arview.assembly.present_lines import PresentLines
 from arview.assembly.turned_poses import Turn, TurnedPoses
-from arview.cad.model import Model
+from arview.cad import Model
 from arview.camera import Camera
 from arview.geometry import Array, are_near, rigid
 from arview.guideviews import GuideViewSet
 from arview.pose import ComponentPresence, Presence, Visibility
-from arview.refinement.view_model import PartView
+from arview.refinement import PartView
 
 VISIBILITIES = (Visibility.VISIBLE, Visibility.HIDDEN, Visibility.OUTSIDE)
 """In the order in which arrays number them."""

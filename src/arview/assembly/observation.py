@@ -20,13 +20,12 @@ from arview.assembly.placements import alternative_placements
 from arview.assembly.presence_net import PartImage, PresenceNet, component_crops
 from arview.assembly.turned_poses import TurnEvidence
 from arview.assembly.visible_edges import VisibleEdgeCache, VisibleEdges
-from arview.cad.model import Model, make_model
+from arview.cad import Model, make_model
 from arview.camera import Camera
-from arview.detection.features.edge_net import EdgeNet
+from arview.detection import EdgeNet
 from arview.geometry import Array, apply, rigid
-from arview.guideviews import GuideViewSet
-from arview.guideviews.surface import Surface
-from arview.refinement.projection import intrinsics_of
+from arview.guideviews import GuideViewSet, Surface
+from arview.refinement import intrinsics_of
 
 MAX_PART_PX = 400.0
 """Larger pictures of the part are shrunk to about this size."""

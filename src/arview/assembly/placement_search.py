@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from arview.assembly.placements import Placements, Swap
 from arview.assembly.presence_net import ComponentCrop, PartImage, PresenceNet, component_crops
-from arview.detection.scoring.crops import BAND_PX
+from arview.detection import BAND_PX
 from arview.geometry import Array
-from arview.guideviews.surface import Surface
+from arview.guideviews import Surface
 
 _NEIGHBOURS = np.array([(x, y) for x in (-1.0, 0.0, 1.0) for y in (-1.0, 0.0, 1.0)])
 """Steps from a placement to those around it, and to itself."""

@@ -11,9 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from arview.cad.fitness import face_areas
-from arview.cad.model import Model
-from arview.cad.samples import Samples, sample_surface
+from arview.cad import Model, Samples, face_areas, sample_surface
 from arview.geometry import Array
 
 MAX_SAMPLES = 4000

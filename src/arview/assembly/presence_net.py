@@ -16,18 +16,20 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.detection.scoring.crops import (
+from arview.detection import (
     BAND_PX,
     DRAWN_CHANNELS,
+    NetworkInput,
+    ScoreNet,
     append_edge_responses,
     append_gradients,
     crop_edge_responses,
     normalise_colours,
+    size_and_contrast,
 )
-from arview.detection.scoring.score_net import NetworkInput, ScoreNet, size_and_contrast
 from arview.geometry import Array, apply
-from arview.guideviews.surface import Surface, draw_surface
-from arview.refinement.projection import project
+from arview.guideviews import Surface, draw_surface
+from arview.refinement import project
 
 SIDE_PX = 48
 """Side of the network's input."""

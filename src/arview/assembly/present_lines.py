@@ -15,10 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from arview.cad.model import Model
-from arview.cad.samples import sample_surface
+from arview.cad import Model, sample_surface
 from arview.geometry import Array, invert
-from arview.refinement.view_model import PartView
+from arview.refinement import PartView
 
 SPACING_SHARE = 0.01
 """Distance of samples of an absent component's surface, in diameters of the part."""

@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from arview.cad.model import Component
-from arview.cad.samples import sample_surface
+from arview.cad import Component, sample_surface
 from arview.geometry import Array, apply, exp_so3, rigid
 
 MAX_SAMPLES = 3000

@@ -12,13 +12,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.cad.model import Model, make_model
+from arview.cad import Model, make_model
 from arview.core.kernel import kernel
 from arview.geometry import Array, apply
-from arview.guideviews import GuideViewSet
-from arview.guideviews.mesh_edges import facing, mesh_edges
-from arview.rendering.renderers import ZBufferRenderer
-from arview.rendering.rendering import Rendering
+from arview.guideviews import GuideViewSet, facing
+from arview.guideviews.mesh_edges import mesh_edges
+from arview.rendering import Rendering, ZBufferRenderer
 
 INITIAL_SAMPLES = 4096
 """Samples for which memory is reserved at first; it doubles when it is full."""

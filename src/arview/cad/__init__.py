@@ -1,27 +1,97 @@
 """CAD: models of named components, part files, ranges of viewpoints, and checks of a part."""
 
-from arview.cad.check import PartCheck, PartFinding, check_part
-from arview.cad.load import load_model
-from arview.cad.model import Component, Model, make_model
-from arview.cad.part import ComponentSettings, Datum, Part, default_view_range
-from arview.cad.part_file import PART_FILE_EXAMPLE, load_part
-from arview.cad.symmetry import Symmetry
-from arview.cad.view_range import ViewRange
+from typing import TYPE_CHECKING
 
-__all__ = [
-    "PART_FILE_EXAMPLE",
-    "Component",
-    "ComponentSettings",
-    "Datum",
-    "Model",
-    "Part",
-    "PartCheck",
-    "PartFinding",
-    "Symmetry",
-    "ViewRange",
-    "check_part",
-    "default_view_range",
-    "load_model",
-    "load_part",
-    "make_model",
-]
+from arview.core.doors import lazy_door
+
+if TYPE_CHECKING:
+    from arview.cad.check import GUESSED_CAMERA as GUESSED_CAMERA
+    from arview.cad.check import PartCheck as PartCheck
+    from arview.cad.check import PartFinding as PartFinding
+    from arview.cad.check import check_part as check_part
+    from arview.cad.datum_check import find_rims as find_rims
+    from arview.cad.fitness import face_areas as face_areas
+    from arview.cad.load import LoadedCad as LoadedCad
+    from arview.cad.load import load_cad as load_cad
+    from arview.cad.load import load_model as load_model
+    from arview.cad.model import Component as Component
+    from arview.cad.model import Model as Model
+    from arview.cad.model import make_model as make_model
+    from arview.cad.part import ComponentSettings as ComponentSettings
+    from arview.cad.part import Datum as Datum
+    from arview.cad.part import DatumFeature as DatumFeature
+    from arview.cad.part import Guide as Guide
+    from arview.cad.part import Part as Part
+    from arview.cad.part import ReworkSettings as ReworkSettings
+    from arview.cad.part import default_view_range as default_view_range
+    from arview.cad.part_file import PART_FILE_EXAMPLE as PART_FILE_EXAMPLE
+    from arview.cad.part_file import find_part_file as find_part_file
+    from arview.cad.part_file import load_part as load_part
+    from arview.cad.part_file import part_from_text as part_from_text
+    from arview.cad.picking import PickedFeature as PickedFeature
+    from arview.cad.picking import pick_features as pick_features
+    from arview.cad.samples import Samples as Samples
+    from arview.cad.samples import sample_surface as sample_surface
+    from arview.cad.symmetry import FoundSymmetry as FoundSymmetry
+    from arview.cad.symmetry import Symmetry as Symmetry
+    from arview.cad.symmetry import find_symmetries as find_symmetries
+    from arview.cad.view_range import ViewRange as ViewRange
+    from arview.cad.viewpoint import Viewpoint as Viewpoint
+    from arview.cad.viewpoint import pose_at as pose_at
+
+__getattr__, __dir__, __all__ = lazy_door(
+    __name__,
+    {
+        "check": (
+            "GUESSED_CAMERA",
+            "PartCheck",
+            "PartFinding",
+            "check_part",
+        ),
+        "datum_check": ("find_rims",),
+        "fitness": ("face_areas",),
+        "load": (
+            "LoadedCad",
+            "load_cad",
+            "load_model",
+        ),
+        "model": (
+            "Component",
+            "Model",
+            "make_model",
+        ),
+        "part": (
+            "ComponentSettings",
+            "Datum",
+            "DatumFeature",
+            "Guide",
+            "Part",
+            "ReworkSettings",
+            "default_view_range",
+        ),
+        "part_file": (
+            "PART_FILE_EXAMPLE",
+            "find_part_file",
+            "load_part",
+            "part_from_text",
+        ),
+        "picking": (
+            "PickedFeature",
+            "pick_features",
+        ),
+        "samples": (
+            "Samples",
+            "sample_surface",
+        ),
+        "symmetry": (
+            "FoundSymmetry",
+            "Symmetry",
+            "find_symmetries",
+        ),
+        "view_range": ("ViewRange",),
+        "viewpoint": (
+            "Viewpoint",
+            "pose_at",
+        ),
+    },
+)

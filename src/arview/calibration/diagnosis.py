@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.fiducials.board import Board, cv_board
+from arview.fiducials import Board, cv_board
 from arview.geometry import Array
 
 _DICTIONARIES = (

@@ -7,8 +7,7 @@ from enum import StrEnum
 
 import numpy as np
 
-from arview.camera import Camera
-from arview.camera.lens import LensDistortion, LensModel
+from arview.camera import Camera, LensDistortion, LensModel
 from arview.errors import InputError
 from arview.geometry import Array, rigid
 

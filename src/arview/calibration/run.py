@@ -16,11 +16,10 @@ from arview.calibration.projection import CalibratedLens, lens_of
 from arview.calibration.solve import MIN_VIEWS, K, Solution, solve
 from arview.calibration.verdict import CalibrationVerdict, assess
 from arview.calibration.views import BoardSightings, BoardView, find_views
-from arview.camera import Camera
-from arview.camera.profiles import lens_record
+from arview.camera import Camera, lens_record
 from arview.core.progress import StepProgress
 from arview.errors import InputError
-from arview.fiducials.board import Board, spec_of
+from arview.fiducials import Board, spec_of
 from arview.version import __version__
 
 

@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from arview.calibration.fisheye import adjust_fisheye
 from arview.calibration.projection import PARAMETERS_OF, CalibratedLens, lens_of, project
 from arview.calibration.views import MIN_CORNERS, BoardView
-from arview.camera import Camera
-from arview.camera.undistort import MAX_HALF_ANGLE_DEG
+from arview.camera import MAX_HALF_ANGLE_DEG, Camera
 from arview.errors import InputError
 from arview.geometry import Array, rigid
 

@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arview.calibration.diagnosis import diagnose_missing_board
-from arview.camera.exif import HEIF_SUFFIXES, PHOTO_SUFFIXES, PhotoExif
+from arview.camera import HEIF_SUFFIXES, PHOTO_SUFFIXES, PhotoExif
 from arview.core.progress import StepProgress
 from arview.errors import InputError
-from arview.fiducials.board import Board, cv_board
+from arview.fiducials import Board, cv_board
 from arview.geometry import Array
 
 MIN_CORNERS = 8
@@ -171,7 +171,7 @@ def _views_of_photos(
     sources: Sequence[str | Path], finder: BoardFinder, progress: StepProgress | None
 ) -> BoardSightings:
     """Search for the board in photos; those of another lens than most are left out."""
-    from arview.reconstruction.intake.reading import photo_paths
+    from arview.reconstruction import photo_paths
 
     paths: list[Path] = []
     for source in sources:
@@ -218,7 +218,7 @@ def _views_of_photos(
 
 def _exif_of_all(paths: Sequence[Path], names: Sequence[str]) -> tuple[dict[str, PhotoExif], dict[str, str]]:
     """EXIF data of the photos, and why others cannot be read, both by name."""
-    from arview.camera.exif import read_exif
+    from arview.camera import read_exif
 
     exifs, rejected = {}, {}
     for path, name in zip(paths, names, strict=True):
@@ -231,7 +231,7 @@ def _exif_of_all(paths: Sequence[Path], names: Sequence[str]) -> tuple[dict[str,
 
 def _one_lens(label: str, exifs: dict[str, PhotoExif]) -> tuple[dict[str, PhotoExif], dict[str, str]]:
     """The photos of the lens that took more than half of them, and why the others are left out."""
-    from arview.reconstruction.intake.lenses import Lens, lenses_of
+    from arview.reconstruction import Lens, lenses_of
 
     turned = []
     for exif in exifs.values():
@@ -262,7 +262,7 @@ def _view_of_photo(path: Path, name: str, turns: int, finder: BoardFinder) -> Bo
     """The view of one photo, or the reason why there is none."""
     import cv2
 
-    from arview.reconstruction.intake.reading import read_photo
+    from arview.reconstruction import read_photo
 
     try:
         upright = read_photo(path)
@@ -284,7 +284,7 @@ def _views_of_video(path: Path, finder: BoardFinder, progress: StepProgress | No
     """Search for the board in the frames of a video."""
     import cv2
 
-    from arview.camera.profiles import exif_of_video
+    from arview.camera import exif_of_video
     from arview.video import open_source
 
     with open_source(path) as source:
@@ -334,7 +334,7 @@ def _speed_px_s(before: BoardView | None, now: BoardView, seconds: float) -> flo
 
 def _blur_px(gray: NDArray[np.uint8], pixels: Array) -> float:
     """Edge spread of the part of the picture that contains the corners; NaN if it is small."""
-    from arview.reconstruction.intake.checks import blur_and_texture
+    from arview.reconstruction import blur_and_texture
 
     height, width = gray.shape
     low = np.maximum(np.floor(pixels.min(axis=0)).astype(int), 0)
@@ -348,7 +348,7 @@ def _some_pictures(sources: Sequence[str | Path], count: int = 3) -> Iterator[ND
     """About ``count`` grey pictures of the sources, for the diagnosis."""
     import cv2
 
-    from arview.reconstruction.intake.reading import photo_paths, read_photo
+    from arview.reconstruction import photo_paths, read_photo
     from arview.video import open_source
 
     if len(sources) == 1 and _is_video(Path(sources[0])):

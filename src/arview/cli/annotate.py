@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, NamedTuple, cast
 
 import click
 
+from arview import guideviews, tracking, workflow
+from arview import overlay as overlays
 from arview.cli.common import (
     MODALITY,
     RENDERER,
@@ -36,14 +38,8 @@ if TYPE_CHECKING:
     from arview.cad import Part
     from arview.camera import Camera
     from arview.geometry import Array
-    from arview.guideviews import GuideViewSet
     from arview.inspection import Inspection
-    from arview.overlay import OverlayOptions, OverlayRenderer
-    from arview.overlay.options import EdgeMode
-    from arview.tracking import SessionOptions, TrackingSession
-    from arview.tracking.self_calibration.session import SelfCalibratingSession
     from arview.video import FrameSource, VideoSink
-    from arview.workflow.specimens import Specimen
 
 
 NAMED_PART = f"{__name__}.named_part"
@@ -285,20 +281,17 @@ def annotate(
     SOURCE is a video file, a picture, a folder, glob or pattern (frame_%04d.png) of pictures, a camera number or an
     RTSP/HTTP address.
     """
-    from arview.tracking.guide_pose import GUIDE_PREFIX
-    from arview.tracking.self_calibration.session import SelfCalibratingSession
     from arview.video import VideoSink, open_source
-    from arview.workflow.specimens import load_specimens
 
     check_profile(profile, camera_spec)
     if output is None and poses_path is None:
         output = _default_output(source)
         say(f"no -o or --poses given: writing {output}")
-    specimens = load_specimens(part_paths, instances, inspection_paths, unit)
+    specimens = workflow.load_specimens(part_paths, instances, inspection_paths, unit)
     if len(specimens) > 1:
         refuse_for_several({"--init": init, "--learned": learned_path, "--guideviews": views_path})
     part = specimens[0].part
-    guide_name = init.removeprefix(GUIDE_PREFIX) if init and init.startswith(GUIDE_PREFIX) else None
+    guide_name = init.removeprefix(tracking.GUIDE_PREFIX) if init and init.startswith(tracking.GUIDE_PREFIX) else None
     init_path = init if guide_name is None else None
     first_pose = load_pose(init_path) if init_path else None
     files = [path for one in specimens for path in (one.part.path, one.part.cad_path)]
@@ -323,7 +316,7 @@ def annotate(
             summary = _annotate_several(run, specimens, views, session_options(modalities), drawing, renderer)
         else:
             summary = _annotate_one(run, session, partial(_overlay, part, specimens[0].inspection, drawing))
-        if isinstance(session, SelfCalibratingSession) and len(specimens) == 1:
+        if isinstance(session, tracking.SelfCalibratingSession) and len(specimens) == 1:
             keep(session.finish())
     if sink is not None and sink.audio_note:
         say(f"warning: {sink.audio_note}")
@@ -335,7 +328,9 @@ def annotate(
 
 
 def _annotate_one(
-    run: _Run, session: TrackingSession | SelfCalibratingSession, make: Callable[[Camera], OverlayRenderer]
+    run: _Run,
+    session: tracking.TrackingSession | tracking.SelfCalibratingSession,
+    make: Callable[[Camera], overlays.OverlayRenderer],
 ) -> AnnotateSummary:
     """Track and draw one specimen."""
     from arview import annotation
@@ -346,23 +341,21 @@ def _annotate_one(
 
 def _annotate_several(
     run: _Run,
-    specimens: Sequence[Specimen],
-    views: GuideViewSet,
-    options: SessionOptions,
-    drawing: OverlayOptions,
+    specimens: Sequence[workflow.Specimen],
+    views: guideviews.GuideViewSet,
+    options: tracking.SessionOptions,
+    drawing: overlays.OverlayOptions,
     renderer: str,
 ) -> AnnotateSummary:
     """Track and draw several specimens; guide views of the first part are given."""
-    from arview.workflow.specimens import make_overlay, make_sessions
-
     camera = run.camera_of(0)
 
-    def views_of(part: Part) -> GuideViewSet:
+    def views_of(part: Part) -> guideviews.GuideViewSet:
         is_first = part.model.source_hash == specimens[0].part.model.source_hash
         return views if is_first else _views_and_guide(part, camera, None, renderer, None)[0]
 
-    sessions = make_sessions(specimens, views_of, camera, options)
-    overlay = None if run.sink is None else make_overlay(specimens, drawing, camera)
+    sessions = workflow.make_sessions(specimens, views_of, camera, options)
+    overlay = None if run.sink is None else workflow.make_overlay(specimens, drawing, camera)
     return run.annotate(sessions, overlay)
 
 
@@ -372,23 +365,25 @@ def _exit_if_interrupted(ctx: click.Context, summary: AnnotateSummary) -> None:
         ctx.exit(ExitCode.INTERRUPTED)
 
 
-def _overlay(part: Part, inspection: Inspection | None, options: OverlayOptions, camera: Camera) -> OverlayRenderer:
-    from arview.overlay import OverlayRenderer
+def _overlay(
+    part: Part, inspection: Inspection | None, options: overlays.OverlayOptions, camera: Camera
+) -> overlays.OverlayRenderer:
 
-    return OverlayRenderer(part.model, camera, inspection, options, serial=part.serial)
+    return overlays.OverlayRenderer(part.model, camera, inspection, options, serial=part.serial)
 
 
-def _drawing_options(show_edges: str, no_ghost: bool, no_labels: bool, opacity: float | None) -> OverlayOptions:
-    from arview.overlay import OverlayOptions
+def _drawing_options(
+    show_edges: str, no_ghost: bool, no_labels: bool, opacity: float | None
+) -> overlays.OverlayOptions:
 
     switches = click.get_current_context().meta
-    return OverlayOptions(
+    return overlays.OverlayOptions(
         show_ghost=not no_ghost,
         show_labels=not no_labels,
         show_legend=not switches[f"{__name__}.no_legend"],
         show_occlusion=not switches[f"{__name__}.no_occlusion"],
-        show_edges=cast("EdgeMode", show_edges),
-        opacity=OverlayOptions.opacity if opacity is None else opacity,
+        show_edges=cast("overlays.EdgeMode", show_edges),
+        opacity=overlays.OverlayOptions.opacity if opacity is None else opacity,
     )
 
 
@@ -411,37 +406,33 @@ def _check_outputs(
 
 def _views_and_guide(
     part: Part, camera: Camera, views_path: str | None, renderer: str, guide_name: str | None
-) -> tuple[GuideViewSet, Array | None]:
+) -> tuple[guideviews.GuideViewSet, Array | None]:
     """Guide views from a file, or cached ones, and the guide pose (4,4) where one was asked for."""
-    from arview.guideviews import GuideViewOptions, load_guide_views
-    from arview.guideviews.cache import cached_guide_views
     from arview.tracking.guide_pose import guide_pose
 
-    views = load_guide_views(Path(views_path), part.model) if views_path else None
+    views = guideviews.load_guide_views(Path(views_path), part.model) if views_path else None
     guide = None
     if guide_name is not None:
         guide = guide_pose(guide_name, part, views.view_range if views else part.effective_view_range, camera)
     if views is None:
         with progress_bar("guide views") as progress:
-            views = cached_guide_views(
-                part.model, part.effective_view_range, GuideViewOptions(renderer=renderer), progress=progress
+            views = guideviews.cached_guide_views(
+                part.model, part.effective_view_range, guideviews.GuideViewOptions(renderer=renderer), progress=progress
             )
     return views, guide
 
 
 def _session(
-    specimen: Specimen,
-    views: GuideViewSet,
-    options: SessionOptions,
+    specimen: workflow.Specimen,
+    views: guideviews.GuideViewSet,
+    options: tracking.SessionOptions,
     guide: Array | None,
     first_pose: Array | None,
     camera: Camera,
     start: Array | None,
-) -> TrackingSession:
+) -> tracking.TrackingSession:
     """A session with a camera, that goes on from a pose (4,4) or else begins as the command says."""
-    from arview.tracking import TrackingSession
-
-    session = TrackingSession(
+    session = tracking.TrackingSession(
         views,
         camera=camera,
         model=specimen.part.model,
@@ -455,23 +446,21 @@ def _session(
     return session
 
 
-def _load_learned(session: TrackingSession | SelfCalibratingSession, path: Path | None) -> None:
+def _load_learned(session: tracking.TrackingSession | tracking.SelfCalibratingSession, path: Path | None) -> None:
     if path is not None and path.exists():
         _tracking(session).appearance_memory.load(path)
 
 
-def _save_learned(session: TrackingSession | SelfCalibratingSession, path: Path | None) -> None:
+def _save_learned(session: tracking.TrackingSession | tracking.SelfCalibratingSession, path: Path | None) -> None:
     if path is not None:
         memory = _tracking(session).appearance_memory
         memory.save(path)
         click.echo(f"wrote {path}: {len(memory)} learned views")
 
 
-def _tracking(session: TrackingSession | SelfCalibratingSession) -> TrackingSession:
+def _tracking(session: tracking.TrackingSession | tracking.SelfCalibratingSession) -> tracking.TrackingSession:
     """The session that tracks, within one that replaces its camera."""
-    from arview.tracking.self_calibration.session import SelfCalibratingSession
-
-    return session.session if isinstance(session, SelfCalibratingSession) else session
+    return session.session if isinstance(session, tracking.SelfCalibratingSession) else session
 
 
 def _print_summary(summary: AnnotateSummary, written: list[Path], notes: Sequence[str], guessed: Camera | None) -> None:

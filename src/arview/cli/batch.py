@@ -11,9 +11,11 @@ import click
 
 from arview.cli.common import main, say
 from arview.cli.exit_codes import ExitCode, exit_code_of
+from arview.quality import batch as quality
+from arview.quality import history
 
 if TYPE_CHECKING:
-    from arview.quality.batch.run import JobResult
+    pass
 
 
 @main.command(
@@ -109,25 +111,20 @@ def batch(
     """Inspect all parts that JOBS.toml names."""
     from tqdm import tqdm
 
-    from arview.quality.batch.jobs_file import load_jobs
-    from arview.quality.batch.run import BatchOptions, run_batch
-
-    jobs = load_jobs(jobs_path)
+    jobs = quality.load_jobs(jobs_path)
     if store is not None:
-        from arview.quality.history import HistoryStore
-
-        HistoryStore(store).close()
-    options = BatchOptions(scheduler, workers or 0, memory_limit, retries, connect_s)
+        history.HistoryStore(store).close()
+    options = quality.BatchOptions(scheduler, workers or 0, memory_limit, retries, connect_s)
     with tqdm(desc="jobs", total=len(jobs), disable=None, leave=False, unit="") as bar:
 
         def started(link: str, count: int) -> None:
             tqdm.write(f"{len(jobs)} jobs on {count} worker{'s' * (count != 1)}; dashboard: {link}")
 
-        def came(result: JobResult) -> None:
+        def came(result: quality.JobResult) -> None:
             tqdm.write(_line(result))
             bar.update()
 
-        results = run_batch(jobs, options, started=started, progress=came)
+        results = quality.run_batch(jobs, options, started=started, progress=came)
     if store is not None:
         _add(results, store, station)
     counts = Counter(one.verdict.replace("_", " ") for one in results)
@@ -140,27 +137,24 @@ def batch(
     click.get_current_context().exit(worst_exit_code(results))
 
 
-def worst_exit_code(results: list[JobResult]) -> ExitCode:
+def worst_exit_code(results: list[quality.JobResult]) -> ExitCode:
     """The worst of all jobs: no verdict, then fail, then undecided."""
     codes = {exit_code_of(one.verdict) for one in results}
     ranking = (ExitCode.CANNOT_MEASURE, ExitCode.FAIL, ExitCode.UNDECIDED)
     return next((code for code in ranking if code in codes), ExitCode.DONE)
 
 
-def _line(result: JobResult) -> str:
+def _line(result: quality.JobResult) -> str:
     kept = " (already done)" if result.is_kept else ""
     return f"{result.name}: {result.verdict.replace('_', ' ')}{kept}; {result.text}; {result.out}"
 
 
-def _add(results: list[JobResult], store: str, station: str | None) -> None:
+def _add(results: list[quality.JobResult], store: str, station: str | None) -> None:
     """Add the results to the store; those already there stay as they are."""
-    from arview.quality.batch.storage import read
-    from arview.quality.history import HistoryStore
-
-    with HistoryStore(store) as opened, tempfile.TemporaryDirectory() as folder:
+    with history.HistoryStore(store) as opened, tempfile.TemporaryDirectory() as folder:
         new = 0
         for one in results:
-            content = read(f"{one.out}/inspection.json") if one.inspection_sha256 else None
+            content = quality.read(f"{one.out}/inspection.json") if one.inspection_sha256 else None
             if content is None:
                 say(f"history: no result of {one.name}")
                 continue

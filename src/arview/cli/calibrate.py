@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from arview import calibration
 from arview.cli.common import Group, main, output_path, progress_bar, say
 from arview.cli.exit_codes import ExitCode
 from arview.core.atomic import write_file
@@ -15,7 +16,7 @@ from arview.core.extras import require
 from arview.errors import InputError, OutputError
 
 if TYPE_CHECKING:
-    from arview.calibration.run import Calibration
+    pass
 
 
 class _WithDefault(Group):
@@ -74,8 +75,7 @@ rulers on the page show whether the printer kept the scale. The page also states
 @click.option("--board", "board_spec", metavar="SPEC", help="charuco:COLUMNSxROWS:SQUARE_MM:MARKER_MM:DICTIONARY.")
 def board(output: str, paper: str, squares: str | None, board_spec: str | None) -> None:
     """Write a ChArUco board as a PDF in true scale."""
-    from arview.fiducials.board import parse_board, spec_of
-    from arview.fiducials.board_sheet import board_pdf, fit_board, parse_paper, place_board
+    from arview.fiducials import board_pdf, fit_board, parse_board, parse_paper, place_board, spec_of
 
     target = output_path(output, [])
     size = parse_paper(paper)
@@ -158,13 +158,8 @@ def lens(
     anyway: bool,
 ) -> None:
     """Calibrate the camera that took PHOTOS (files, folders, globs), or VIDEO, of a ChArUco board."""
-    from arview.calibration.choose import ChoiceOptions
-    from arview.calibration.projection import CalibratedLens
-    from arview.calibration.run import calibrate as run
-    from arview.calibration.run import record_of
-    from arview.camera.profiles import profile_name, profile_path
-    from arview.camera.write import holds_distortion, write_camera
-    from arview.fiducials.board import parse_board
+    from arview.camera import holds_distortion, profile_name, profile_path, write_camera
+    from arview.fiducials import parse_board
 
     if not outputs and profile is None:
         raise InputError("nothing to write: give -o camera.json or --profile")
@@ -179,19 +174,21 @@ def lens(
         profile_path(profile)
     one = parse_board(board_spec)
     with progress_bar("looking for the board") as progress:
-        choice = ChoiceOptions(max_views=max_views, candidates=max(max_views, ChoiceOptions.candidates))
-        result = run(sources, one, choice, progress=progress, lens=CalibratedLens(lens_model))
+        choice = calibration.ChoiceOptions(
+            max_views=max_views, candidates=max(max_views, calibration.ChoiceOptions.candidates)
+        )
+        result = calibration.calibrate(
+            sources, one, choice, progress=progress, lens=calibration.CalibratedLens(lens_model)
+        )
     _print(result)
     if picture is not None:
-        from arview.calibration.plot import draw
-
-        write_file(picture, draw(result, picture.suffix.lower().removeprefix(".")))
+        write_file(picture, calibration.draw(result, picture.suffix.lower().removeprefix(".")))
         click.echo(f"wrote {picture}")
     not_enough = result.verdict.grade.value == "not enough"
     if not_enough and not (anyway and math.isfinite(result.verdict.focal_u)):
         say("no camera was written; follow the advice" + ("" if anyway else ", or write it with --anyway"))
         click.get_current_context().exit(ExitCode.CANNOT_MEASURE)
-    extra = record_of(result)
+    extra = calibration.record_of(result)
     if profile is not None:
         kept = profile_path(profile or profile_name(result.lens))
         if not profile and not result.lens.get("model"):
@@ -219,7 +216,7 @@ Examples:
 )
 def profiles() -> None:
     """List the profiles stored by `--profile`, and where they are."""
-    from arview.camera.profiles import list_profiles, profile_folder
+    from arview.camera import list_profiles, profile_folder
 
     found = list_profiles()
     for one in found:
@@ -229,7 +226,7 @@ def profiles() -> None:
 
 
 def _format_and_path(text: str) -> tuple[str, str]:
-    from arview.camera.write import FORMATS, format_of
+    from arview.camera import FORMATS, format_of
 
     kind, colon, path = text.partition(":")
     if colon and kind in FORMATS:
@@ -246,7 +243,7 @@ def _parse_squares(text: str | None) -> tuple[int | None, int | None]:
     return int(columns), int(rows)
 
 
-def _print(result: Calibration) -> None:
+def _print(result: calibration.Calibration) -> None:
     """Print what was seen, the camera with U, the verdict and advice; warnings go to stderr."""
     seen, solution, verdict = result.sightings, result.solution, result.verdict
     for warning in seen.warnings:
@@ -276,15 +273,14 @@ def _print(result: Calibration) -> None:
         click.echo(f"advice: {advice}")
 
 
-def _camera_lines(result: Calibration) -> list[str]:
-    from arview.calibration.projection import intrinsics_of, lens_of
+def _camera_lines(result: calibration.Calibration) -> list[str]:
 
     verdict, solution = result.verdict, result.solution
     cells = [
         f"{name} {value:{form}} ± {2 * std:{form}}"
         for name, value, std, form in zip(
             solution.parameters,
-            intrinsics_of(result.camera),
+            calibration.intrinsics_of(result.camera),
             solution.std,
             [".2f"] * 4 + [".5f"] * (len(solution.parameters) - 4),
             strict=True,
@@ -293,6 +289,6 @@ def _camera_lines(result: Calibration) -> list[str]:
     worst = f"{verdict.pixel_u_px[0]:.2f} px in the median, {verdict.pixel_u_px[1]:.2f} px at worst"
     return [
         f"camera: {', '.join(cells[:4])} px",
-        f"lens ({lens_of(result.camera)}): {', '.join(cells[4:])}",
+        f"lens ({calibration.lens_of(result.camera)}): {', '.join(cells[4:])}",
         f"uncertainty (k = 2): focal length {100 * verdict.focal_u:.2f} %, image position of a ray {worst}",
     ]

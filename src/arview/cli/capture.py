@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from arview import guideviews, tracking
 from arview.cli.common import (
     RENDERER,
     UNIT,
@@ -23,16 +24,14 @@ from arview.cli.common import (
     start_session,
 )
 from arview.cli.exit_codes import ExitCode
+from arview.station import capture as station
+from arview.station import walk
 
 if TYPE_CHECKING:
     from arview.cad import Part
     from arview.camera import Camera
     from arview.core.progress import StepProgress
     from arview.geometry import Array
-    from arview.guideviews import GuideViewSet
-    from arview.station.capture import CaptureAdvice
-    from arview.station.walk.job import JobFolder
-    from arview.tracking import TrackingSession
 
 SAID_EVERY_S = 3.0
 """Time between two lines that say where to go, with a camera."""
@@ -103,10 +102,7 @@ def capture(
 ) -> None:
     """Take the photos of a part that are worth measuring out of SOURCE: a film, pictures, a camera or an address."""
     from arview.cad import load_part
-    from arview.camera.write import write_camera
-    from arview.guideviews import GuideViewOptions
-    from arview.guideviews.cache import cached_guide_views
-    from arview.station.walk.capture import capture_options, capture_photos, open_folder, summary_lines
+    from arview.camera import write_camera
     from arview.video import open_source
 
     part = load_part(part_path, unit)
@@ -115,18 +111,21 @@ def capture(
         camera = camera_for(frames, camera_spec, source)
         folder = Path(output)
         was_there = folder.exists()
-        job = open_folder(folder, part, serial, camera_spec)
+        job = walk.open_folder(folder, part, serial, camera_spec)
         try:
             with progress_bar("guide views") as progress:
-                views = cached_guide_views(
-                    part.model, part.effective_view_range, GuideViewOptions(renderer=renderer), progress=progress
+                views = guideviews.cached_guide_views(
+                    part.model,
+                    part.effective_view_range,
+                    guideviews.GuideViewOptions(renderer=renderer),
+                    progress=progress,
                 )
             make = partial(_session, part, views, first_pose)
             keep = partial(report_estimate, profile=None, source=source, turns=frames.quarter_turns_clockwise)
             session, camera_of = start_session(make, frames, camera, camera_spec is None, views, keep)
             with progress_bar("frames", frames.frame_count) as progress:
                 show = _Teller(frames.is_live, frames.frame_count or 0, progress)
-                summary = capture_photos(frames, session, part, camera_of, job, capture_options(count), show)
+                summary = walk.capture_photos(frames, session, part, camera_of, job, walk.capture_options(count), show)
             if summary.photos and camera_spec is not None:
                 write_camera(camera, folder / "camera.json")
         finally:
@@ -136,7 +135,7 @@ def capture(
             say(f"note: {note}")
     if summary.ended_reason:
         say(f"warning: {summary.ended_reason}")
-    for line in summary_lines(summary, part):
+    for line in walk.summary_lines(summary, part):
         click.echo(line)
     if summary.photos:
         click.echo(f"\nwrote {folder}: use it with arview inspect --photos {folder}")
@@ -152,17 +151,15 @@ def capture(
 
 
 def _session(
-    part: Part, views: GuideViewSet, first_pose: Array | None, camera: Camera, start: Array | None
-) -> TrackingSession:
+    part: Part, views: guideviews.GuideViewSet, first_pose: Array | None, camera: Camera, start: Array | None
+) -> tracking.TrackingSession:
     """A session that starts at a rough pose (4,4), or searches."""
-    from arview.tracking import TrackingSession
-
-    return TrackingSession(
+    return tracking.TrackingSession(
         views, camera=camera, model=part.model, initial_cam_from_model=first_pose if start is None else start
     )
 
 
-def _remove(job: JobFolder, was_there: bool) -> None:
+def _remove(job: walk.JobFolder, was_there: bool) -> None:
     """Remove the folder of a capture without photos, or what was put into it."""
     if not was_there:
         shutil.rmtree(job.path, ignore_errors=True)
@@ -180,7 +177,7 @@ class _Teller:
         self._said = ""
         self._said_s = -SAID_EVERY_S
 
-    def __call__(self, done: int, advice: CaptureAdvice) -> None:
+    def __call__(self, done: int, advice: station.CaptureAdvice) -> None:
         self._progress(done, self._frames)
         text = "; ".join(one for one in (f"{advice.photos} taken", advice.text, advice.reason) if one)
         now_s = time.monotonic()

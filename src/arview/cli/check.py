@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import click
 
+from arview import guideviews
 from arview.cli.common import UNIT, Command, main
 from arview.errors import InputError
 
@@ -41,9 +42,7 @@ def check(part: str, unit: str | None, camera_spec: str | None, others: tuple[st
     geometry. Findings are not errors: the exit code is 0.
     """
     from arview.cad import check_part, load_part
-    from arview.camera.read import load_camera
-    from arview.guideviews.findings import uniqueness_findings
-    from arview.guideviews.look_alikes import compare_parts
+    from arview.camera import load_camera
 
     loaded = load_part(part, unit)
     beside = [load_part(other, unit) for other in others]
@@ -52,9 +51,9 @@ def check(part: str, unit: str | None, camera_spec: str | None, others: tuple[st
         size = (1280, 720) if camera_spec.startswith("fov:") else (None, None)
         camera = load_camera(camera_spec, *size)
     try:
-        findings = uniqueness_findings(loaded.model, loaded.effective_view_range)
+        findings = guideviews.uniqueness_findings(loaded.model, loaded.effective_view_range)
     except InputError:  # a range of views that cannot be used, which the check of the part explains
         findings = []
     if beside:
-        findings += [one.finding() for one in compare_parts(loaded, beside)]
+        findings += [one.finding() for one in guideviews.compare_parts(loaded, beside)]
     click.echo(check_part(loaded, camera).with_findings(findings).format())

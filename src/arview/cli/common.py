@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 
 import click
 
+from arview import guideviews, tracking
 from arview.cli.exit_codes import ExitCode, help_rows
 from arview.core.atomic import is_device
 from arview.core.plug_ins import find_plug_ins, load_plug_in
@@ -26,10 +27,6 @@ from arview.version import __version__
 if TYPE_CHECKING:
     from arview.camera import Camera
     from arview.geometry import Array
-    from arview.guideviews import GuideViewSet
-    from arview.tracking import SessionOptions, TrackingSession
-    from arview.tracking.self_calibration.estimator import FocalEstimate
-    from arview.tracking.self_calibration.session import MakeSession, SelfCalibratingSession
     from arview.video import FrameSource
 
 COMMANDS_GROUP = "arview.commands"
@@ -299,11 +296,9 @@ MODALITY = click.option(
 )
 
 
-def session_options(modalities: tuple[str, ...]) -> SessionOptions:
+def session_options(modalities: tuple[str, ...]) -> tracking.SessionOptions:
     """Options of a tracking session that uses these modalities."""
-    from arview.tracking import SessionOptions
-
-    return SessionOptions(
+    return tracking.SessionOptions(
         use_region="region" in modalities,
         use_edge="edge" in modalities,
         use_texture="feature" in modalities,
@@ -314,8 +309,8 @@ def session_options(modalities: tuple[str, ...]) -> SessionOptions:
 
 def camera_for(frames: FrameSource, spec: str | None, source: str) -> Camera:
     """Camera of a source's frames. Without ``spec`` it is guessed, and a warning says so."""
-    from arview.camera.read import guess_camera
-    from arview.video.intrinsics import load_camera_of
+    from arview.camera import guess_camera
+    from arview.video import load_camera_of
 
     if spec is not None:
         return load_camera_of(frames, spec, source)
@@ -328,23 +323,22 @@ def camera_for(frames: FrameSource, spec: str | None, source: str) -> Camera:
 
 
 def start_session(
-    make_session: MakeSession,
+    make_session: tracking.MakeSession,
     frames: FrameSource,
     camera: Camera,
     is_guessed: bool,
-    views: GuideViewSet,
-    keep: Callable[[FocalEstimate], None],
-) -> tuple[TrackingSession | SelfCalibratingSession, Callable[[int], Camera]]:
+    views: guideviews.GuideViewSet,
+    keep: Callable[[tracking.FocalEstimate], None],
+) -> tuple[tracking.TrackingSession | tracking.SelfCalibratingSession, Callable[[int], Camera]]:
     """The session for a source, and the camera of each of its frames by index.
 
     A guessed camera is estimated: of a film in a first pass, of which ``keep`` gets the result, else while it runs.
     """
     from arview.annotation import estimate_camera
-    from arview.tracking.self_calibration.session import SelfCalibratingSession
 
     if not is_guessed:
         return make_session(camera, None), lambda index: camera
-    following = SelfCalibratingSession(make_session, views, camera)
+    following = tracking.SelfCalibratingSession(make_session, views, camera)
     if frames.is_live:
         return following, following.camera_of
     with progress_bar("focal length") as progress:
@@ -417,7 +411,7 @@ def output_path(path: str, inputs: list[Any]) -> Path:
     Raises:
         OutputError: the file cannot be written there, or would overwrite one of ``inputs``.
     """
-    from arview.camera.read import split_spec
+    from arview.camera import split_spec
 
     target = Path(path)
     if not target.parent.is_dir():
@@ -445,7 +439,7 @@ def check_profile(name: str | None, camera_spec: str | None) -> None:
     Raises:
         InputError: a camera was given, so that nothing is estimated, or the name is no name of a profile.
     """
-    from arview.camera.profiles import profile_path
+    from arview.camera import profile_path
 
     if name is None:
         return
@@ -454,7 +448,7 @@ def check_profile(name: str | None, camera_spec: str | None) -> None:
     profile_path(name)
 
 
-def report_estimate(estimate: FocalEstimate, profile: str | None, source: str, turns: int) -> None:
+def report_estimate(estimate: tracking.FocalEstimate, profile: str | None, source: str, turns: int) -> None:
     """Say what was estimated, and keep it as a profile if one was asked for.
 
     Args:
@@ -463,8 +457,6 @@ def report_estimate(estimate: FocalEstimate, profile: str | None, source: str, t
         source: video that it was estimated from.
         turns: quarter turns clockwise applied to its frames.
     """
-    from arview.tracking.self_calibration.profile import keep_profile
-
     can_be_kept = estimate.is_determined and profile is None
     say(estimate.text + ("; keep it with --save-profile NAME" if can_be_kept else ""))
     if profile is None:
@@ -472,7 +464,7 @@ def report_estimate(estimate: FocalEstimate, profile: str | None, source: str, t
     if not estimate.is_determined:
         say(f"profile {profile} was not written")
         return
-    path = keep_profile(estimate, profile, source, turns)
+    path = tracking.keep_profile(estimate, profile, source, turns)
     say(f"wrote {path}; use it with --camera profile:{profile}")
 
 

@@ -7,10 +7,12 @@ from pathlib import Path
 
 import click
 
+from arview import acceptance
 from arview.cli.common import UNIT, main, output_path, say
 from arview.core.atomic import write_file
 from arview.core.extras import require
 from arview.errors import InputError, OutputError
+from arview.quality import decisions
 
 FORMATS = ("csv", "qif", "dfq", "glb", "html", "pdf", "decisions")
 
@@ -73,14 +75,10 @@ def export(
 ) -> None:
     """Write INSPECTION in other formats."""
     from arview.cad import load_part
-    from arview.inspection import load_inspection
-    from arview.inspection.export import to_csv, to_dfq, to_glb
-    from arview.inspection.fingerprint import fingerprint_of_file
-    from arview.quality.decisions import decisions_csv, log_of
-    from arview.quality.decisions.table import decided_cells
+    from arview.inspection import fingerprint_of_file, load_inspection, to_csv, to_dfq, to_glb
 
     if "qif" in formats:
-        from arview.inspection.export import to_qif
+        from arview.inspection import to_qif
     if {"html", "pdf"} & set(formats):
         require("a report", "jinja2", "markupsafe", "matplotlib", *(("weasyprint",) if "pdf" in formats else ()))
     source = Path(inspection)
@@ -90,12 +88,12 @@ def export(
         raise InputError("glb: the CAD is needed; name it with --part")
     loaded = load_inspection(source, None if part is None else part.model)
     sha256 = fingerprint_of_file(source)
-    content = log_of(source).content()
+    content = decisions.log_of(source).content()
     for line in (*content.faults, *content.notices):
         say(line)
     made: dict[str, Callable[[], bytes]] = {
-        "csv": lambda: to_csv(loaded, sha256, decided_cells(content.entries)).encode("utf-8"),
-        "decisions": lambda: decisions_csv(content.entries, loaded.part, loaded.serial).encode("utf-8"),
+        "csv": lambda: to_csv(loaded, sha256, decisions.decided_cells(content.entries)).encode("utf-8"),
+        "decisions": lambda: decisions.decisions_csv(content.entries, loaded.part, loaded.serial).encode("utf-8"),
         "qif": lambda: to_qif(loaded, sha256),
         "dfq": lambda: to_dfq(loaded, sha256),
     }
@@ -117,8 +115,6 @@ def export(
 
 def _targets(source: Path, formats: tuple[str, ...], output: str | None, part_path: str | None) -> dict[str, Path]:
     """The file of each format; a folder that is not there is made where the name ends in / or has no ending."""
-    from arview.quality.decisions import log_of
-
     inputs = [source, part_path]
     folder = source.parent if output is None else Path(output)
     if output is not None and not folder.is_dir():
@@ -132,7 +128,7 @@ def _targets(source: Path, formats: tuple[str, ...], output: str | None, part_pa
             raise OutputError(f"{output}: the folder cannot be made ({error.strerror})") from error
     names = {name: f"{source.stem}.{name}" for name in formats}
     if "decisions" in names:
-        names["decisions"] = log_of(source).path.with_suffix(".csv").name
+        names["decisions"] = decisions.log_of(source).path.with_suffix(".csv").name
     return {name: output_path(str(folder / file), inputs) for name, file in names.items()}
 
 
@@ -169,16 +165,14 @@ comma. Verdicts follow ISO 14253-1 from U and the tolerances of the part file.""
 @UNIT
 def new(part: str, output: str, values: str | None, serial: str | None, force: bool, unit: str | None) -> None:
     """Write a valid inspection file of PART."""
-    from arview.acceptance.position_list import read_position_list
     from arview.cad import load_part
-    from arview.inspection import save_inspection
-    from arview.inspection.summary import verdict_sentence
+    from arview.inspection import save_inspection, verdict_sentence
     from arview.workflow.new_inspection import new_inspection
 
     target = output_path(output, [part, values])
     if Path(target).exists() and not force:
         raise InputError(f"{target}: exists; name another file with -o, or write over it with --force")
-    listed = () if values is None else read_position_list(values)
+    listed = () if values is None else acceptance.read_position_list(values)
     made = new_inspection(load_part(part, unit), listed, serial, values or "")
     save_inspection(made, target)
     click.echo(f"wrote {target}: {verdict_sentence(made)}")

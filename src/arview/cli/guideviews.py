@@ -6,6 +6,7 @@ import time
 
 import click
 
+from arview import guideviews as guide_views
 from arview.cli.common import RENDERER, UNIT, main, output_path, progress_bar, say
 from arview.cli.exit_codes import ExitCode
 from arview.core.atomic import write_file
@@ -55,11 +56,7 @@ def guideviews(
     `annotate` makes and caches guide views by itself; a file saves that step on another machine.
     """
     from arview.cad import load_part
-    from arview.guideviews import GuideViewOptions, make_guide_views
-    from arview.guideviews.findings import confusable_pair
-    from arview.guideviews.report import uniqueness_report
-    from arview.guideviews.uniqueness import assess
-    from arview.rendering.renderers import choose_renderer
+    from arview.rendering import choose_renderer
 
     loaded = load_part(part, unit)
     path = output_path(output, [loaded.path, loaded.cad_path])
@@ -68,10 +65,10 @@ def guideviews(
         raise OutputError(f"{preview}: the name of the preview must end in .png or .jpg")
     report_path = output_path(report, [loaded.path, loaded.cad_path, path, preview_path]) if report else None
     model = loaded.model.only([component]) if component else loaded.model
-    options = GuideViewOptions(subdivisions=SUBDIVISIONS[spacing], renderer=choose_renderer(renderer).name)
+    options = guide_views.GuideViewOptions(subdivisions=SUBDIVISIONS[spacing], renderer=choose_renderer(renderer).name)
     began = time.perf_counter()
     with progress_bar("guide views") as progress:
-        views = make_guide_views(model, loaded.effective_view_range, options, progress=progress)
+        views = guide_views.make_guide_views(model, loaded.effective_view_range, options, progress=progress)
     views.save(path, packed)
     seconds = time.perf_counter() - began
     size_mb = path.stat().st_size / 1e6
@@ -79,22 +76,20 @@ def guideviews(
         f"{path}: {len(views)} views of {model.name} in {seconds:.1f} s, {size_mb:.1f} MB; "
         f"drawn by {choose_renderer(renderer)}"
     )
-    unique = assess(views)
+    unique = guide_views.assess(views)
     click.echo(f"{unique.reason} (score {unique.score:.2f})")
-    alike = confusable_pair(views, unique)
+    alike = guide_views.confusable_pair(views, unique)
     if alike:
         click.echo(alike)
     if preview_path is not None:
         import cv2
 
-        from arview.guideviews.sheet import contact_sheet
-
-        sheet = cv2.cvtColor(contact_sheet(model, views, unique=unique), cv2.COLOR_RGB2BGR)
+        sheet = cv2.cvtColor(guide_views.contact_sheet(model, views, unique=unique), cv2.COLOR_RGB2BGR)
         _, content = cv2.imencode(preview_path.suffix.lower(), sheet)
         write_file(preview_path, content.tobytes())
         click.echo(f"wrote {preview_path}")
     if report_path is not None:
-        write_file(report_path, uniqueness_report(views, unique).encode())
+        write_file(report_path, guide_views.uniqueness_report(views, unique).encode())
         click.echo(f"wrote {report_path}")
 
 
@@ -135,8 +130,7 @@ def studio(part: str, port: int, others: tuple[str, ...], unit: str | None, no_b
 
     require_extra("arview studio", "station")
     from arview.cad import load_part
-    from arview.station.studio.document import StudioDocument
-    from arview.station.studio.server import StudioServer
+    from arview.station.studio import StudioDocument, StudioServer
 
     server = StudioServer(StudioDocument(part, unit), port, [load_part(other, unit) for other in others])
 

@@ -15,10 +15,11 @@ from arview.cli.exit_codes import ExitCode
 from arview.core.atomic import write_file
 from arview.core.extras import require
 from arview.errors import ArviewError, InputError
+from arview.quality import decisions
+from arview.quality import history as quality
 
 if TYPE_CHECKING:
-    from arview.quality.decisions import Decision, RecordState
-    from arview.quality.history import Capability, ComponentSeries, ControlChart, HistoryStore, StoredResult
+    pass
 
 _SHOWN_CHANGES = 8
 _QUANTITIES = ("distance", "dx", "dy", "dz", "tilt", "twist")
@@ -252,17 +253,14 @@ def chart(
     output: str | None, zone: tzinfo, part: str | None, station: str | None, since: str | None, store: str | None,
 ) -> None:  # fmt: skip
     """Show the trend of a component over the parts, with control limits, Cp and Cpk."""
-    from arview.quality.history import Capability, capability_by_limits, control_chart, series_of
-
     if output is not None:
         require("a figure", "matplotlib")
-    from arview.quality.history.chart import FORMATS, draw
 
     target = None if output is None else output_path(output, [])
-    if target is not None and target.suffix.lstrip(".").lower() not in FORMATS:
-        raise InputError(f"{target}: expected a name that ends with {', '.join('.' + one for one in FORMATS)}")
+    if target is not None and target.suffix.lstrip(".").lower() not in quality.FORMATS:
+        raise InputError(f"{target}: expected a name that ends with {', '.join('.' + one for one in quality.FORMATS)}")
     with _open(store, must_exist=True) as opened:
-        series = series_of(
+        series = quality.series_of(
             opened, component, quantity, part, station, _moment(since, zone), repeats, revisions  # type: ignore[arg-type]
         )  # fmt: skip
     series = series.with_limits(lower, upper).in_zone(zone)
@@ -277,7 +275,7 @@ def chart(
         click.echo(f"and {len(changes) - _SHOWN_CHANGES} more changes")
     limits = None
     try:
-        limits = control_chart(values, series.is_length)
+        limits = quality.control_chart(values, series.is_length)
         _print_chart(limits, series)
     except ArviewError as error:
         say(str(error))
@@ -285,17 +283,17 @@ def chart(
     if within:
         click.echo(f"{sum(within)} of {len(within)} within the limits that held for them")
     ability = None
-    found = capability_by_limits(series)
+    found = quality.capability_by_limits(series)
     for (low, high), one in found.items():
         _print_capability(one, series, (low, high) if len(found) > 1 else None)
-        if isinstance(one, Capability) and (low, high) == (series.lower, series.upper):
+        if isinstance(one, quality.Capability) and (low, high) == (series.lower, series.upper):
             ability = one
     if target is not None:
-        write_file(target, draw(series, limits, ability, target.suffix.lstrip(".").lower()))
+        write_file(target, quality.draw(series, limits, ability, target.suffix.lstrip(".").lower()))
         click.echo(f"wrote {target}")
 
 
-def _print_chart(limits: ControlChart, series: ComponentSeries) -> None:
+def _print_chart(limits: quality.ControlChart, series: quality.ComponentSeries) -> None:
     click.echo(f"mean {limits.center:+.4f}, control limits {limits.lower:+.4f} to {limits.upper:+.4f}, "
                f"mean moving range {limits.range_center:.4f}")  # fmt: skip
     for index, why in limits.signals.items():
@@ -304,15 +302,15 @@ def _print_chart(limits: ControlChart, series: ComponentSeries) -> None:
 
 
 def _print_capability(
-    ability: Capability | InputError, series: ComponentSeries, limits: tuple[float | None, float | None] | None
+    ability: quality.Capability | InputError,
+    series: quality.ComponentSeries,
+    limits: tuple[float | None, float | None] | None,
 ) -> None:
     """Print the indices of the values with these limits; of all values with None."""
-    from arview.quality.history.series import limits_text
-
     lead = ""
     if limits is not None:
         values = series.by_limits()[limits]
-        lead = f"limits {limits_text(values[0])}, {_count(values)}: "
+        lead = f"limits {quality.limits_text(values[0])}, {_count(values)}: "
     if isinstance(ability, InputError):
         say(f"{lead}{ability}")
         return
@@ -344,15 +342,13 @@ def export(
     store: str | None,
 ) -> None:  # fmt: skip
     """Write results to a file; its times are UTC."""
-    from arview.quality.history.export import to_csv, to_json_lines
-
     target = output_path(output, [])
     kind = target.suffix.lower()
     if kind not in (".csv", ".jsonl"):
         raise InputError(f"{target}: expected a name that ends with .csv or .jsonl")
     with _open(store, must_exist=True) as opened:
         found = opened.listed(part, serial, station, since=_moment(since, zone))
-        content = to_csv(opened, found) if kind == ".csv" else to_json_lines(opened, found)
+        content = quality.to_csv(opened, found) if kind == ".csv" else quality.to_json_lines(opened, found)
     write_file(target, content)
     click.echo(f"wrote {target}: {len(found)} results")
 
@@ -395,8 +391,6 @@ def list_decisions(
     store: str | None,
 ) -> None:  # fmt: skip
     """List the decisions, ticks and signatures about the results."""
-    from arview.quality.decisions import decisions_csv
-
     target = None if output is None else output_path(output, [])
     with _open(store, must_exist=True) as opened:
         found = opened.listed(part, serial, station, since=_moment(since, zone))
@@ -406,18 +400,17 @@ def list_decisions(
         _print_decisions(rows, zone)
         click.echo(f"{len(rows)} entr{'y' if len(rows) == 1 else 'ies'}")
         return
-    pieces = [decisions_csv(decided[one.id], one.part, one.serial) for one in found if one.id in decided]
-    head = decisions_csv(())
+    pieces = [decisions.decisions_csv(decided[one.id], one.part, one.serial) for one in found if one.id in decided]
+    head = decisions.decisions_csv(())
     write_file(target, (head + "".join(piece.removeprefix(head) for piece in pieces)).encode("utf-8"))
     click.echo(f"wrote {target}: {len(rows)} entries")
 
 
-def _print_decisions(rows: Sequence[tuple[StoredResult, Decision]], zone: tzinfo) -> None:
-    from arview.quality.decisions.table import decision_word
+def _print_decisions(rows: Sequence[tuple[quality.StoredResult, decisions.Decision]], zone: tzinfo) -> None:
 
     cells: list[tuple[str, ...]] = []
     for result, one in rows:
-        word = decision_word(one) or one.kind
+        word = decisions.decision_word(one) or one.kind
         if one.step is not None:
             word = f"step {one.step + 1} {'done' if one.is_done else 'not done'}"
         time = f"{one.time.astimezone(zone):%Y-%m-%d %H:%M:%S}"
@@ -428,13 +421,13 @@ def _print_decisions(rows: Sequence[tuple[StoredResult, Decision]], zone: tzinfo
     _table(("no.", f"decided ({zone})", "serial", "component", "decision", "by", "reason and note"), cells)
 
 
-def _states(store: HistoryStore, found: Sequence[StoredResult]) -> dict[int, RecordState]:
+def _states(store: quality.HistoryStore, found: Sequence[quality.StoredResult]) -> dict[int, decisions.RecordState]:
     """What people decided about results, for those about which there is something."""
     by_id = {one.id: one for one in found}
     return {number: store.state(by_id[number], entries) for number, entries in store.decided(list(by_id)).items()}
 
 
-def _decided_word(state: RecordState | None) -> str:
+def _decided_word(state: decisions.RecordState | None) -> str:
     if state is None:
         return "-"
     if state.faults:
@@ -446,10 +439,9 @@ def _decided_word(state: RecordState | None) -> str:
     return "void" if state.signature.void else "not released"
 
 
-def _open(store: str | None, must_exist: bool = False) -> HistoryStore:
-    from arview.quality.history import HistoryStore, default_store
+def _open(store: str | None, must_exist: bool = False) -> quality.HistoryStore:
 
-    return HistoryStore(store or default_store(), must_exist)
+    return quality.HistoryStore(store or quality.default_store(), must_exist)
 
 
 def _moment(text: str | None, zone: tzinfo) -> datetime | None:
@@ -463,7 +455,7 @@ def _moment(text: str | None, zone: tzinfo) -> datetime | None:
     return moment if moment.tzinfo is not None else moment.replace(tzinfo=zone)
 
 
-def _about(one: StoredResult) -> None:
+def _about(one: quality.StoredResult) -> None:
     click.echo(f"no. {one.id}, {one.part} {one.serial}, {one.verdict.replace('_', ' ')}")
     click.echo(f"measured {one.measured:%Y-%m-%d %H:%M:%S} UTC at {one.station} by {one.tool}")
     click.echo(f"added    {one.added:%Y-%m-%d %H:%M:%S} UTC, content {one.content_hash}")

@@ -8,12 +8,14 @@ from typing import TYPE_CHECKING
 
 import click
 
+from arview import workflow
 from arview.cli.common import UNIT, main, say
 from arview.cli.exit_codes import ExitCode, exit_code_of
 from arview.core.progress import Progress
+from arview.quality import history
 
 if TYPE_CHECKING:
-    from arview.workflow.run import Outcome
+    pass
 
 
 @main.command(
@@ -149,10 +151,7 @@ def inspect(
     unit: str | None,
 ) -> None:
     """Inspect one part: reconstruct PHOTOS, measure and decide; write report, coloured cloud, annotated VIDEO."""
-    from arview.workflow.job import InspectJob
-    from arview.workflow.run import inspect_part
-
-    job = InspectJob(
+    job = workflow.InspectJob(
         part_path,
         photos,
         video,
@@ -174,16 +173,12 @@ def inspect(
         pairs=pairs,
     )
     if store is not None:
-        from arview.quality.history import HistoryStore
-
-        HistoryStore(store).close()  # a store that cannot be used is reported now, not after the measurement
+        history.HistoryStore(store).close()  # a store that cannot be used is reported now, not after the measurement
     with line_bar(video is not None, photos is None, not no_pdf) as progress:
-        outcome = inspect_part(job, output, progress=progress, starts_over=force)
+        outcome = workflow.inspect_part(job, output, progress=progress, starts_over=force)
     print_outcome(outcome)
     if store is not None:
-        from arview.quality.history import HistoryStore
-
-        with HistoryStore(store) as opened:
+        with history.HistoryStore(store) as opened:
             added = opened.add(outcome.folder / "inspection.json", station)
             state = "added as" if added.is_new else "already there as"
             click.echo(f"history: {state} {added.id} in {opened.name}")
@@ -191,12 +186,12 @@ def inspect(
     click.get_current_context().exit(exit_code_of(outcome.verdict.value))
 
 
-def word(outcome: Outcome) -> str:
+def word(outcome: workflow.Outcome) -> str:
     """The verdict in capitals, followed by the counts."""
     return f"{outcome.verdict.value.replace('_', ' ').upper()}; {outcome.sentence}"
 
 
-def print_outcome(outcome: Outcome) -> None:
+def print_outcome(outcome: workflow.Outcome) -> None:
     """Print what was measured, the time and result of each stage, and the files; warnings go to stderr."""
     from arview.cli.measure import print_components
 
@@ -220,12 +215,10 @@ def line_bar(has_film: bool, is_from_video: bool, has_pdf: bool) -> Iterator[Pro
     """Show one bar for all stages, with the time left, if stderr is a terminal."""
     from tqdm import tqdm
 
-    from arview.workflow.progress import ProgressEstimate, ProgressEstimator, time_text
-
     with tqdm(total=100.0, disable=None, leave=False, bar_format="{desc} {percentage:3.0f} % |{bar}|") as bar:
 
-        def show(moment: ProgressEstimate) -> None:
-            bar.set_description_str(f"{moment.step:18}{time_text(moment):>18}", refresh=False)
+        def show(moment: workflow.ProgressEstimate) -> None:
+            bar.set_description_str(f"{moment.step:18}{workflow.time_text(moment):>18}", refresh=False)
             bar.update(100.0 * moment.share - bar.n)
 
-        yield ProgressEstimator(show, is_from_video, has_film, has_pdf).update
+        yield workflow.ProgressEstimator(show, is_from_video, has_film, has_pdf).update

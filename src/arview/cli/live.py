@@ -15,15 +15,15 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from arview import guideviews
 from arview.cli.common import RENDERER, UNIT, check_profile, main, output_path, progress_bar, refuse_for_several, say
 from arview.cli.exit_codes import ExitCode
 from arview.core.extras import require, require_extra
 from arview.errors import InputError, MissingDependencyError
+from arview.station import live as station
 
 if TYPE_CHECKING:
-    from arview.station.live.server.hub import Hub
-    from arview.station.live.server.live_server import LiveServer
-    from arview.station.live.stream.subjects import Subjects
+    pass
 
 STOP_DEADLINE_S = 4.6
 """Time from a signal to the end of the program, whatever its workers do."""
@@ -68,9 +68,7 @@ def _keep_device_option(ctx: click.Context, parameter: click.Parameter, value: b
 
 def _list_devices() -> None:
     """Print the paired devices."""
-    from arview.station.live.security.devices import devices_path, read_devices
-
-    devices = read_devices(devices_path())
+    devices = station.read_devices(station.devices_path())
     width = max((len(one.name) for one in devices), default=0)
     for one in sorted(devices, key=lambda one: one.last_used, reverse=True):
         click.echo(f"{one.name:{width}}  paired {one.created:%Y-%m-%d}  last used {one.last_used:%Y-%m-%d %H:%M} UTC")
@@ -80,9 +78,7 @@ def _list_devices() -> None:
 
 def _revoke_devices(names: tuple[str, ...]) -> None:
     """Forget paired devices. Raises InputError for a name that none has."""
-    from arview.station.live.security.devices import Devices, devices_path
-
-    devices = Devices(devices_path())
+    devices = station.Devices(station.devices_path())
     for name in dict.fromkeys(names):
         if not devices.revoke(name):
             known = ", ".join(one.name for one in devices.listed()) or "none"
@@ -278,10 +274,6 @@ def live(
     import asyncio
 
     require_extra("arview live", "station")
-    from arview.station.live.options import JobOptions, LiveOptions, RecordingOptions
-    from arview.station.live.security.devices import devices_path
-    from arview.station.live.server.live_server import LiveServer, open_endpoint
-
     check_profile(profile, camera_spec)
     _check_inputs(part_paths, source)
     if instances * len(part_paths) > 1:
@@ -292,34 +284,38 @@ def live(
         raise InputError("--cert and --key belong together; give both or none")
     inputs = [*part_paths, views_path, *inspection_paths, camera_spec, source]
     record_path = _record_path(record, inputs) if record else None
-    options = LiveOptions(
+    options = station.LiveOptions(
         source=source,
         camera=camera_spec,
         photo_camera=photo_camera,
         profile=profile,
-        devices=devices_path(),
+        devices=station.devices_path(),
         inspections=tuple(Path(path) for path in inspection_paths),
         serial=serial,
         max_age_s=max_age,
         guide=init.removeprefix("guide:") if init else None,
         record=record_path,
         record_folder=record_path.parent if record_path else Path(),
-        recording=RecordingOptions(quota_bytes=round(1e9 * quota)),
-        jobs=JobOptions(folder=Path(jobs)),
+        recording=station.RecordingOptions(quota_bytes=round(1e9 * quota)),
+        jobs=station.JobOptions(folder=Path(jobs)),
         width=size[0],
         height=size[1],
         fps=fps,
         clients=clients,
     )
     _tell_logs()
-    server = LiveServer(options, open_endpoint(host, port, is_plain, cert, key))
-    from arview.guideviews import GuideViewOptions
-    from arview.station.live.server.loading import load_subjects
+    server = station.LiveServer(options, station.open_endpoint(host, port, is_plain, cert, key))
 
-    def load() -> Subjects:
+    def load() -> station.Subjects:
         with progress_bar("guide views") as progress:
-            return load_subjects(
-                part_paths, unit, views_path, options, GuideViewOptions(renderer=renderer), progress, instances
+            return station.load_subjects(
+                part_paths,
+                unit,
+                views_path,
+                options,
+                guideviews.GuideViewOptions(renderer=renderer),
+                progress,
+                instances,
             )
 
     with _stopped_by_signals(server):
@@ -331,8 +327,8 @@ def live(
 
 def _check_inputs(part_paths: tuple[str, ...], source: str) -> None:
     """Check that the parts and the source are there, before anything takes time. Raises InputError."""
-    from arview.cad.part_file import find_part_file
-    from arview.video.sources import check_source
+    from arview.cad import find_part_file
+    from arview.video import check_source
 
     for path in part_paths:
         find_part_file(path)
@@ -350,7 +346,7 @@ def _record_path(record: str, inputs: list[Any]) -> Path:
 
 
 @contextmanager
-def _stopped_by_signals(server: LiveServer) -> Iterator[None]:
+def _stopped_by_signals(server: station.LiveServer) -> Iterator[None]:
     """Stop the server at the first SIGINT or SIGTERM: in good order, or anyway when it takes too long.
 
     A thread of its own waits for the signal (`signal.set_wakeup_fd`), so that neither a blocked event loop nor a stuck
@@ -395,22 +391,21 @@ def _leave_threads() -> None:
         os._exit(ExitCode.INTERRUPTED)
 
 
-async def _serve(server: LiveServer, load: Callable[[], Subjects]) -> None:
-    from arview.station.live.server.loading import warm_up
+async def _serve(server: station.LiveServer, load: Callable[[], station.Subjects]) -> None:
 
-    def ready(hub: Hub) -> None:
+    def ready(hub: station.Hub) -> None:
         gc.collect()
         gc.freeze()  # what is loaded stays: the collector need not visit it again while phones wait
         _print_welcome(server)
         if hub.subjects is not None:
             for notice in hub.subjects.notices():
                 say(f"{notice.level}: {notice.text}")
-            warm_up(hub.subjects)
+            station.warm_up(hub.subjects)
 
     await server.serve(load, ready)
 
 
-def _print_welcome(server: LiveServer) -> None:
+def _print_welcome(server: station.LiveServer) -> None:
     try:
         require("an inspection started on the page", "pycolmap", "jinja2", "markupsafe", "matplotlib")
     except MissingDependencyError as error:
@@ -419,10 +414,8 @@ def _print_welcome(server: LiveServer) -> None:
     certificates = endpoint.certificates
     click.echo(f"page:  {server.link}")
     if endpoint.trust_link is not None and certificates is not None and certificates.authority_der is not None:
-        from arview.station.live.security.trust_page import fingerprint
-
         click.echo(f"first time on a phone:  {endpoint.trust_link}")
-        click.echo(f"fingerprint:  {fingerprint(certificates.authority_der)}")
+        click.echo(f"fingerprint:  {station.fingerprint(certificates.authority_der)}")
         if certificates.is_authority_new:
             _print_code(
                 "new certificate authority: every phone has to trust this station once, so scan this first:",

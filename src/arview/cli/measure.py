@@ -8,18 +8,18 @@ from typing import TYPE_CHECKING
 
 import click
 
+from arview import measurement
 from arview.cli.common import UNIT, main, output_path, say, stage_bar
 from arview.cli.exit_codes import ExitCode, exit_code_of
 from arview.errors import InputError
 
 if TYPE_CHECKING:
     from arview.inspection import ComponentDeviation, Inspection
-    from arview.measurement.types import Method
 
 METHODS = ("sweep", "edges", "cloud")
 
 
-def _parse_methods(ctx: click.Context, parameter: click.Parameter, value: str) -> tuple[Method, ...]:
+def _parse_methods(ctx: click.Context, parameter: click.Parameter, value: str) -> tuple[measurement.Method, ...]:
     names = [name.strip() for name in value.split(",") if name.strip()]
     chosen = tuple(name for name in METHODS if name in names)
     if not chosen or any(name not in METHODS for name in names):
@@ -121,7 +121,7 @@ def measure(
     photos: str | None,
     tolerance: float | None,
     guard: float,
-    methods: tuple[Method, ...],
+    methods: tuple[measurement.Method, ...],
     correct_bias: bool,
     no_monte_carlo: bool,
     no_maps: bool,
@@ -131,13 +131,8 @@ def measure(
 ) -> None:
     """Measure the displacement of each component of PART in the reconstruction OUT, or in a cloud."""
     from arview.cad import load_part
-    from arview.inspection import save_inspection
-    from arview.inspection.summary import overall_verdict
+    from arview.inspection import overall_verdict, save_inspection
     from arview.measurement import run
-    from arview.measurement.folder import read_cloud, read_folder
-    from arview.measurement.options import MeasureOptions
-    from arview.measurement.uncertainty.budget import UncertaintyOptions
-    from arview.measurement.uncertainty.decision import DecisionOptions
 
     if (folder is None) == (cloud_path is None):
         raise InputError("give either OUT, the folder of `arview reconstruct`, or --cloud FILE")
@@ -146,19 +141,19 @@ def measure(
     place = Path(folder) if folder is not None else Path(cloud_path or "").parent
     target = output_path(output or str(place / "inspection.json"), [part_path])
     part = load_part(part_path, unit)
-    options = MeasureOptions(
+    options = measurement.MeasureOptions(
         methods=methods,
         tolerance_mm=tolerance,
         corrects_bias=correct_bias,
         uses_inconsistent=anyway,
         maps_folder=None if no_maps else target.parent / f"{target.stem}_distances",
-        uncertainty=UncertaintyOptions(monte_carlo=not no_monte_carlo, seed=seed),
-        decision=DecisionOptions(guard),
+        uncertainty=measurement.UncertaintyOptions(monte_carlo=not no_monte_carlo, seed=seed),
+        decision=measurement.DecisionOptions(guard),
     )
     if folder is None:
-        reconstruction = read_cloud(cloud_path or "", part.model, cloud_unit, rescale)
+        reconstruction = measurement.read_cloud(cloud_path or "", part.model, cloud_unit, rescale)
     else:
-        reconstruction = read_folder(folder, photos, "cloud" in methods)
+        reconstruction = measurement.read_folder(folder, photos, "cloud" in methods)
     try:
         with stage_bar() as progress:
             inspection = run.measure(reconstruction, part, options, progress=progress)
@@ -225,7 +220,7 @@ def print_components(inspection: Inspection) -> None:
 
 def _row(component: ComponentDeviation) -> str:
     """Numbers in mm and degrees with the decimals that U allows; ``?`` means undetermined."""
-    from arview.inspection.rounding import decimals_beside_limit, decimals_of
+    from arview.inspection import decimals_beside_limit, decimals_of
 
     decimals = decimals_of(component.uncertainty_mm)
     of_distance = decimals_beside_limit(component.distance_mm or 0.0, component.uncertainty_mm, component.tolerance_mm)

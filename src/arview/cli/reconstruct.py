@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, get_args
 
 import click
 
+from arview import reconstruction, workflow
 from arview.cli.common import UNIT, main, say, stage_bar
 from arview.cli.exit_codes import ExitCode
 from arview.errors import InputError
 
 if TYPE_CHECKING:
-    from arview.reconstruction.run import Reconstruction
-    from arview.reconstruction.scale import ScaleSources
+    pass
 
 STAGES = ("photos", "sparse", "scale", "dense")
 
@@ -134,28 +134,23 @@ def reconstruct(
     """
     from arview.cad import load_part
     from arview.reconstruction import run
-    from arview.reconstruction.dense import DenseOptions
-    from arview.reconstruction.intake import VideoIntakeOptions
-    from arview.reconstruction.part_masks import AUTO
-    from arview.reconstruction.sparse import SparseOptions
-    from arview.workflow.silhouettes import CadSilhouettes
 
     folder = Path(output)
     if folder.exists() and not folder.is_dir():
         raise InputError(f"{output}: is a file; give a folder for the results")
     if Path(source).is_dir() and folder.resolve() == Path(source).resolve():
         raise InputError(f"{output}: is the folder of the photos; give another one for the results")
-    if masks == AUTO and part_path is None:
+    if masks == reconstruction.AUTO and part_path is None:
         raise InputError("--masks auto masks by the CAD's silhouette; give the CAD with --part, or a folder of masks")
     part = load_part(part_path, unit) if part_path else None
     options = run.ReconstructOptions(
-        video=VideoIntakeOptions(max_frames=max_frames),
-        sparse=SparseOptions(seed=seed, threads=threads, device=device),
+        video=reconstruction.VideoIntakeOptions(max_frames=max_frames),
+        sparse=reconstruction.SparseOptions(seed=seed, threads=threads, device=device),
         sources=_sources(boards, tags, bars, scale_file, rig),
-        dense=DenseOptions(seed=seed, band_mm=band, threads=threads, device=device),
+        dense=reconstruction.DenseOptions(seed=seed, band_mm=band, threads=threads, device=device),
         poses=Path(poses) if poses else None,
-        masks=Path(masks) if masks and masks != AUTO else None,
-        silhouettes=CadSilhouettes(part) if masks == AUTO and part is not None else None,
+        masks=Path(masks) if masks and masks != reconstruction.AUTO else None,
+        silhouettes=workflow.CadSilhouettes(part) if masks == reconstruction.AUTO and part is not None else None,
         last_stage=get_args(run.StageName)[STAGES.index(until)],
         starts_over=force,
     )
@@ -166,29 +161,23 @@ def reconstruct(
 
 def _sources(
     boards: tuple[str, ...], tags: tuple[str, ...], bars: tuple[str, ...], scale_file: str | None, rig: str | None
-) -> ScaleSources:
+) -> reconstruction.ScaleSources:
     """The known lengths in the scene, from the options and the file together."""
     from dataclasses import replace
 
-    from arview.fiducials.board import parse_board, parse_tags
-    from arview.reconstruction.scale import (
-        ScaleSources,
-        load_rig,
-        load_scale_file,
-        parse_scale_bar,
-    )
+    from arview.fiducials import parse_board, parse_tags
 
-    known = load_scale_file(scale_file) if scale_file else ScaleSources()
+    known = reconstruction.load_scale_file(scale_file) if scale_file else reconstruction.ScaleSources()
     return replace(
         known,
         boards=(*known.boards, *(parse_board(text) for text in boards)),
         tags=(*known.tags, *(parse_tags(text) for text in tags)),
-        bars=(*known.bars, *(parse_scale_bar(text) for text in bars)),
-        rig=load_rig(rig) if rig else known.rig,
+        bars=(*known.bars, *(reconstruction.parse_scale_bar(text) for text in bars)),
+        rig=reconstruction.load_rig(rig) if rig else known.rig,
     )
 
 
-def _print(result: Reconstruction, has_part: bool) -> None:
+def _print(result: reconstruction.Reconstruction, has_part: bool) -> None:
     """Print what was found, in a few lines; warnings go to stderr."""
     for name, reason in result.intake.rejected:
         say(f"left out {name}: {reason}")

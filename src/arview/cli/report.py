@@ -12,6 +12,8 @@ from arview.cli.common import UNIT, main, output_path, say, stage_bar
 from arview.cli.exit_codes import ExitCode
 from arview.core.atomic import write_file
 from arview.errors import InputError, MissingDependencyError, OutputError
+from arview.quality import decisions as quality
+from arview.quality import history
 
 
 @main.command(
@@ -103,12 +105,12 @@ def rework(inspection: str, part_path: str, output: str | None, as_json: bool, u
     """Say what to do about the components of INSPECTION that are out of tolerance."""
     from arview.cad import load_part
     from arview.inspection import load_inspection
-    from arview.quality.rework import drawing_svg, instruction_document, instructions
+    from arview.quality.rework import drawing_svg, instruction_document, make_instructions
 
     part = load_part(part_path, unit)
     loaded = load_inspection(inspection, part.model)
     folder = None if output is None else _made_folder(output)
-    found = instructions(part, loaded)
+    found = make_instructions(part, loaded)
     if as_json:
         click.echo(json.dumps([instruction_document(one) for one in found], indent=2, ensure_ascii=False))
     for one in () if as_json else found:
@@ -167,11 +169,9 @@ def decide(
     job: str, component: str, ok: bool, not_ok: bool, reason: str, photo: str | None, note: str, by: str
 ) -> None:
     """Decide about COMPONENT of JOB."""
-    from arview.quality.decisions import decide_component
-
     if ok == not_ok:
         raise click.UsageError("give either --ok or --not-ok, not both" if ok else "give --ok or --not-ok")
-    made = decide_component(job, component, ok, reason, note, by, photo)
+    made = quality.decide_component(job, component, ok, reason, note, by, photo)
     click.echo(f"entry {made.number}: {component} {'OK' if ok else 'not OK'}, {made.by}")
     _told_state(job)
 
@@ -200,22 +200,17 @@ def sign(job: str, note: str, by: str, store: str | None) -> None:
     """Sign the inspection of JOB as it is now."""
     from contextlib import ExitStack
 
-    from arview.quality.decisions import sign_inspection
-    from arview.quality.decisions.folder import first_inspection, rechecks_of
-
     with ExitStack() as stack:
         opened = None
         if store is not None:
-            from arview.quality.history import HistoryStore
-
-            first_inspection(job)  # an error of the job comes first
-            opened = stack.enter_context(HistoryStore(store))  # before a signature that cannot be taken back
-        sign_inspection(job, by, note)
+            quality.first_inspection(job)  # an error of the job comes first
+            opened = stack.enter_context(history.HistoryStore(store))  # before a signature that cannot be taken back
+        quality.sign_inspection(job, by, note)
         is_released = _told_state(job)
         if opened is not None:
-            for path, _ in rechecks_of(job):
+            for path, _ in quality.rechecks_of(job):
                 opened.add(path)
-            added = opened.add(first_inspection(job))
+            added = opened.add(quality.first_inspection(job))
             click.echo(f"{opened.name}: result {added.id}, {added.decisions} new entries")
     click.get_current_context().exit(ExitCode.DONE if is_released else ExitCode.FAIL)
 
@@ -236,17 +231,14 @@ Examples:
 def decisions(job: str, output: str | None) -> None:
     """List the decisions, ticks and signatures of JOB."""
     from arview.inspection import load_inspection
-    from arview.quality.decisions import decisions_csv, log_of
-    from arview.quality.decisions.folder import inspection_path
-    from arview.quality.decisions.table import decision_word
 
-    path = inspection_path(job)
+    path = quality.inspection_path(job)
     if not path.is_file():
         raise InputError(f"{path}: no such inspection; give a job folder or an inspection.json")
-    target = None if output is None else output_path(output, [path, log_of(job).path])
-    content = log_of(job).content()
+    target = None if output is None else output_path(output, [path, quality.log_of(job).path])
+    content = quality.log_of(job).content()
     for one in content.entries:
-        words = [one.component, decision_word(one)]
+        words = [one.component, quality.decision_word(one)]
         if one.step is not None:
             words.append(f"step {one.step + 1} {'done' if one.is_done else 'not done'}")
         text = "; ".join(word for word in (one.reason, one.note) if word)
@@ -254,7 +246,7 @@ def decisions(job: str, output: str | None) -> None:
         click.echo(f"{one.number:>4}  {one.time:%Y-%m-%d %H:%M:%S}  {one.by}: {line}{f' ({text})' if text else ''}")
     if target is not None:
         loaded = load_inspection(path)
-        write_file(target, decisions_csv(content.entries, loaded.part, loaded.serial).encode("utf-8"))
+        write_file(target, quality.decisions_csv(content.entries, loaded.part, loaded.serial).encode("utf-8"))
         click.echo(f"wrote {target}")
     _told_state(job)
     if content.faults:
@@ -263,9 +255,7 @@ def decisions(job: str, output: str | None) -> None:
 
 def _told_state(job: str) -> bool:
     """Print what was decided so far, and bring the report up to date; whether the part is released."""
-    from arview.quality.decisions import state_of_record
-
-    state = state_of_record(job)
+    state = quality.state_of_record(job)
     for line in (*state.faults, *state.notices):
         say(line)
     if state.sentence:
@@ -277,9 +267,7 @@ def _told_state(job: str) -> bool:
 
 def _not_updated(job: str) -> tuple[Path, ...]:
     """Bring the reports of a record up to date, if there are any; those that could not be are returned."""
-    from arview.quality.decisions.folder import first_inspection
-
-    if not first_inspection(job).with_name("report.html").is_file():
+    if not quality.first_inspection(job).with_name("report.html").is_file():
         return ()
     try:
         from arview.report import update_reports

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from arview import acceptance
 from arview.cli.common import UNIT, main, output_path, say
 from arview.cli.exit_codes import ExitCode, exit_code_of
 from arview.core.atomic import write_file
@@ -16,8 +17,7 @@ from arview.core.extras import require
 from arview.errors import InputError
 
 if TYPE_CHECKING:
-    from arview.acceptance.conformity import LengthResult, Verification
-    from arview.cad.model import Model
+    from arview.cad import Model
 
 _SHOWN = 12
 _COMPARED = ("dx", "dy", "dz", "distance", "U", "U list", "E_n")
@@ -79,12 +79,9 @@ def verify(
     shows_all: bool,
 ) -> None:
     """Test what was MEASURED against KNOWN lengths: errors, limits, and whether the stated U is confirmed."""
-    from arview.acceptance.conformity import parse_limit, record_of
-    from arview.acceptance.conformity import verify as run
-    from arview.acceptance.lengths import read_known, read_measured
     from arview.cad import load_part
 
-    limit = None if mpe is None else parse_limit(mpe)
+    limit = None if mpe is None else acceptance.parse_limit(mpe)
     target = None if output is None else output_path(output, [measured, known])
     picture = None if plot is None else output_path(plot, [measured, known, target])
     if picture is not None:
@@ -94,16 +91,14 @@ def verify(
             raise InputError(f"{known}: lists components, not lengths; --mpe and --plot do not apply")
         _compare(measured, known, target, None if part_path is None else load_part(part_path, unit).model, shows_all)
         return
-    places = read_measured(measured)
-    test = run(places, read_known(known, places), known, limit)
+    places = acceptance.read_measured(measured)
+    test = acceptance.verify(places, acceptance.read_known(known, places), known, limit)
     _print(test, shows_all)
     if target is not None:
-        write_file(target, (json.dumps(record_of(test), indent=2, ensure_ascii=False) + "\n").encode())
+        write_file(target, (json.dumps(acceptance.record_of(test), indent=2, ensure_ascii=False) + "\n").encode())
         click.echo(f"wrote {target}")
     if picture is not None:
-        from arview.acceptance.plot import draw
-
-        write_file(picture, draw(test, picture.suffix.lower().removeprefix(".")))
+        write_file(picture, acceptance.draw(test, picture.suffix.lower().removeprefix(".")))
         click.echo(f"wrote {picture}")
     click.get_current_context().exit(exit_code_of(test.verdict.value))
 
@@ -151,22 +146,18 @@ def compare(
 
 def _is_list(measured: str, known: str) -> bool:
     """Whether KNOWN lists components and MEASURED is an inspection to compare them with."""
-    from arview.acceptance.position_list import is_position_list
-
     source = Path(measured)
     is_inspection = source.is_dir() or source.suffix.lower() == ".json"
-    return is_inspection and Path(known).is_file() and is_position_list(known)
+    return is_inspection and Path(known).is_file() and acceptance.is_position_list(known)
 
 
 def _compare(measured: str, known: str, target: Path | None, model: Model | None, shows_all: bool) -> None:
     """Compare an inspection with a list of components, and end with the exit code of the comparison."""
-    from arview.acceptance.comparison import compare, record_of
-    from arview.acceptance.position_list import read_position_list
     from arview.inspection import load_inspection
 
     source = Path(measured)
     source = source / "inspection.json" if source.is_dir() else source
-    found = compare(load_inspection(source, model), read_position_list(known), known, model)
+    found = acceptance.compare(load_inspection(source, model), acceptance.read_position_list(known), known, model)
     _print_left_out(found.left_out)
     width = max(9, *(len(one.name) for one in found.components))
     click.echo(f"{'component':{width}}" + "".join(f"{head:>9}" for head in _COMPARED))
@@ -185,7 +176,9 @@ def _compare(measured: str, known: str, target: Path | None, model: Model | None
     agreeing = sum(bool(one.agrees) for one in found.components)
     click.echo(f"E_n ≤ 1 for {agreeing} of {len(found.components)} components")
     if target is not None:
-        write_file(target, (json.dumps(record_of(found), indent=2, ensure_ascii=False) + "\n").encode())
+        write_file(
+            target, (json.dumps(acceptance.comparison_record(found), indent=2, ensure_ascii=False) + "\n").encode()
+        )
         click.echo(f"wrote {target}")
     everything = all(one.agrees is not False for one in found.components)
     click.get_current_context().exit(ExitCode.DONE if everything else ExitCode.FAIL)
@@ -202,8 +195,7 @@ def _print_left_out(left_out: dict[str, str]) -> None:
         say(f"left out {len(left_out) - _SHOWN} more")
 
 
-def _print(test: Verification, shows_all: bool) -> None:
-    from arview.acceptance.conformity import FULL_TEST, UncertaintyCheck
+def _print(test: acceptance.Verification, shows_all: bool) -> None:
 
     _print_left_out(test.left_out)
     ranked = sorted(test.lengths, key=lambda one: -abs(one.error_mm) / (one.limit_mm or 1.0))
@@ -221,7 +213,7 @@ def _print(test: Verification, shows_all: bool) -> None:
         f" {largest.known.mm:.1f} mm), {len(test.lengths)} lengths from {min(o.known.mm for o in test.lengths):.1f} to"
         f" {max(o.known.mm for o in test.lengths):.1f} mm"
     )
-    if test.u_held is UncertaintyCheck.NOT_STATED:
+    if test.u_held is acceptance.UncertaintyCheck.NOT_STATED:
         click.echo("U: not stated in the measurement")
     else:
         low, high = test.expected
@@ -230,14 +222,14 @@ def _print(test: Verification, shows_all: bool) -> None:
             f"U (k = 2) {test.u_held}: {test.within} of {len(test.lengths)} errors are within it, {low} to {high} are"
             f" expected if it is right ({why}); the errors are {test.ratio:.2f} × the stated U"
         )
-    if len(test.lengths) < FULL_TEST:
-        click.echo(f"note: VDI/VDE 2634 part 1 asks for {FULL_TEST} lengths, five on each of seven lines")
+    if len(test.lengths) < acceptance.FULL_TEST:
+        click.echo(f"note: VDI/VDE 2634 part 1 asks for {acceptance.FULL_TEST} lengths, five on each of seven lines")
     counts = [f"{sum(one.verdict.value == v for one in test.lengths)} {v}" for v in ("pass", "fail", "undecided")]
     counted = f" ({', '.join(counts)})" if test.limit is not None else " (U alone: no --mpe was given)"
     click.echo(f"verdict: {test.verdict.value}{counted}")
 
 
-def _row(one: LengthResult, width: int) -> str:
+def _row(one: acceptance.LengthResult, width: int) -> str:
     def cell(value: float | None, size: int) -> str:
         return f"{'' if value is None else format(value, '.3f'):>{size}}"
 

@@ -14,7 +14,7 @@ import math
 from functools import cache
 from typing import NamedTuple
 
-from arview.refinement.evidence import PoseEvidence
+from arview.refinement import PoseEvidence
 from arview.weights import load_weights
 
 MIN_VERIFIER_SCORE = -4.0

@@ -14,8 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.camera import Camera
-from arview.camera.undistort import FrameView
+from arview.camera import Camera, FrameView
 from arview.core.checks import check_type
 from arview.detection.confidence import ConfidenceTerms, Margins, confidence_terms, pose_probability
 from arview.detection.disambiguation import Disambiguator, is_rotated_by
@@ -39,9 +38,8 @@ from arview.detection.search.local_search import DISTINCT_DEG, LocalSearch, Loca
 from arview.detection.symmetry import find_rotational_symmetries
 from arview.errors import InputError
 from arview.geometry import Array
-from arview.guideviews import GuideViewSet
-from arview.guideviews.sphere import icosphere_directions
-from arview.refinement.evidence import PoseEvidence
+from arview.guideviews import GuideViewSet, icosphere_directions
+from arview.refinement import PoseEvidence
 
 SAME_ASIDE = 0.12
 SAME_ALONG = 0.15

@@ -7,12 +7,11 @@ from dataclasses import asdict
 from functools import cache
 from pathlib import Path
 
-from arview.cad.model import Model
-from arview.cad.view_range import ViewRange
+from arview.cad import Model, ViewRange
 from arview.core.cache_folder import cache_folder
 from arview.core.progress import StepProgress
 from arview.errors import ArviewError
-from arview.guideviews import GuideViewOptions, GuideViewSet, load_guide_views, make_guide_views
+from arview.guideviews.views import GuideViewOptions, GuideViewSet, load_guide_views, make_guide_views
 from arview.version import __version__
 
 

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from arview.cad.check import PartFinding
-from arview.cad.model import Model
-from arview.cad.view_range import ViewRange
+from arview.cad import Model, PartFinding, ViewRange
 from arview.geometry import Array
 from arview.guideviews.sphere import ASSESSED_SUBDIVISIONS, MIN_ASSESSED_VIEWS, directions_in_range
 from arview.guideviews.uniqueness import CONFUSABLE_LIKENESS, Uniqueness, assess

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from arview.cad.check import PartFinding
-from arview.cad.part import Part
+from arview.cad import Part, PartFinding
 from arview.guideviews.findings import assessed_guide_views, describe_view
 from arview.guideviews.uniqueness import CONFUSABLE_LIKENESS, MAX_WEAK_SHARE, likeness_between
 from arview.guideviews.views import GuideViewSet

@@ -6,14 +6,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.cad.model import Model
+from arview.cad import Model
 from arview.errors import InputError
 from arview.geometry import apply
 from arview.guideviews.findings import azimuths_deg, confusable_pair, elevations_deg
 from arview.guideviews.mesh_edges import EDGE_SHARP
 from arview.guideviews.uniqueness import CONFUSABLE_LIKENESS, PLAIN_LINES, Uniqueness, assess
 from arview.guideviews.views import GuideViewSet
-from arview.rendering.renderers import ZBufferRenderer
+from arview.rendering import ZBufferRenderer
 
 PAPER = (250, 250, 250)
 INK = (40, 40, 40)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from arview.cad.view_range import ViewRange
+from arview.cad import ViewRange
 from arview.geometry import Array, look_at
 
 ASSESSED_SUBDIVISIONS = 2

@@ -7,10 +7,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.cad.model import Model
+from arview.cad import Model
 from arview.core.kernel import kernel
 from arview.geometry import Array
-from arview.rendering.rasterizer import fill_buffers
+from arview.rendering import fill_buffers
 
 MAX_FACES = 20_000
 """Largest number of faces; a mesh with more is reduced."""

@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.cad.model import Model
-from arview.cad.view_range import ViewRange
+from arview.cad import Model, ViewRange
 from arview.camera import Camera
 from arview.core.checks import PATH, check_type
 from arview.core.progress import StepProgress
@@ -26,8 +25,7 @@ from arview.guideviews.sphere import directions_in_range, view_poses
 from arview.guideviews.store import read_arrays, write_arrays
 from arview.guideviews.surface import Surface, reduced_surface, surface_about
 from arview.guideviews.validity import check_arrays, check_poses
-from arview.rendering.renderers import open_renderer
-from arview.rendering.rendering import Rendering
+from arview.rendering import Rendering, open_renderer
 
 FORMAT_VERSION = 2
 _UNIT16 = 32767.0

@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from arview.cad.model import Model
+from arview.cad import Model
 from arview.core.checks import PATH, check_type
 from arview.core.durable import replace_durably
 from arview.errors import InputError, MismatchError, OutputError

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from enum import StrEnum
 
-from arview.cad.model import Model
+from arview.cad import Model
 from arview.errors import InputError, MismatchError
 from arview.inspection.details import DatumSystem, Details, DistanceReport, ForeignReport, Repeatability
 

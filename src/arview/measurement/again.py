@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from arview.cad.part import Part
+from arview.cad import Part
 from arview.core.progress import Progress
 from arview.errors import InputError
 from arview.inspection import ComponentDeviation, Inspection
@@ -30,8 +30,7 @@ from arview.measurement.records import (
 from arview.measurement.run import align_to_datums, measure_all
 from arview.measurement.seen_from import seen_from, with_seen_from
 from arview.measurement.uncertainty.pose_propagation import PosePropagation
-from arview.reconstruction.scale.cad import base_names
-from arview.reconstruction.types import SparseModel
+from arview.reconstruction import SparseModel, base_names
 
 
 def measure_again(

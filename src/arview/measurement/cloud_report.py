@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from arview.cad.model import Model
+from arview.cad import Model
 from arview.errors import InputError, OutputError
 from arview.geometry import apply, invert
 from arview.inspection import ComponentDeviation, DistanceReport, ForeignReport, Verdict
@@ -22,7 +22,7 @@ from arview.measurement.cloud.distance_map import (
 from arview.measurement.cloud.foreign_objects import ForeignObject, find_foreign
 from arview.measurement.datums.alignment import Alignment
 from arview.measurement.plot import save_picture
-from arview.reconstruction.types import DenseCloud
+from arview.reconstruction import DenseCloud
 
 
 def inspect_cloud(

@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from arview.cad.model import Model
-from arview.cad.part import Part
+from arview.cad import Model, Part
 from arview.camera import Camera
 from arview.core.extras import require
 from arview.errors import InputError
@@ -25,10 +24,17 @@ from arview.measurement.cloud.reading import (
     unit_of_option,
 )
 from arview.measurement.cloud.scale_check import cloud_scale
-from arview.reconstruction.colmap import read_reconstruction, sparse_model_of
-from arview.reconstruction.scale.cad import base_names
-from arview.reconstruction.scale.types import Consistency, ScaleEvidence, ScaleResult
-from arview.reconstruction.types import DenseCloud, Photo, SparseModel
+from arview.reconstruction import (
+    Consistency,
+    DenseCloud,
+    Photo,
+    ScaleEvidence,
+    ScaleResult,
+    SparseModel,
+    base_names,
+    read_reconstruction,
+    sparse_model_of,
+)
 
 _NORMALS_WITHIN_MM = 3.0
 """Distance from the CAD within which the side of a cloud's normals is compared with the surface's."""
@@ -90,7 +96,7 @@ def read_folder(folder: str | Path, photos: str | Path | None = None, with_cloud
         sparse = replace(sparse, pose_covariance=np.load(covariance))
     cloud = None
     if has_cloud:
-        from arview.reconstruction.dense import read_ply
+        from arview.reconstruction import read_ply
 
         cloud = read_ply(folder / "cloud.ply")
     frame = np.eye(4) if scale.model_from_scan is None else scale.model_from_scan
@@ -141,7 +147,7 @@ def read_cloud(
 
 def _own_ply(path: Path) -> DenseCloud | None:
     """The cloud of a PLY file that arview wrote, which is in mm, else None."""
-    from arview.reconstruction.dense import read_ply
+    from arview.reconstruction import read_ply
 
     try:
         with path.open("rb") as file:

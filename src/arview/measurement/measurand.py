@@ -6,12 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from arview.cad.datum_check import find_rims
-from arview.cad.fitness import face_areas
-from arview.cad.model import Component, Model
-from arview.cad.part import Part
-from arview.cad.samples import sample_surface
-from arview.cad.symmetry import Symmetry
+from arview.cad import Component, Model, Part, Symmetry, face_areas, find_rims, sample_surface
 from arview.errors import InputError
 from arview.geometry import Array
 from arview.measurement.photo.patches import near_others, symmetries_of, tangents_of

@@ -10,7 +10,7 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.cad.part import ComponentSettings, Part
+from arview.cad import ComponentSettings, Part
 from arview.core.stage_cache import content_key
 from arview.geometry import Array, exp_so3, rigid
 from arview.inspection import (

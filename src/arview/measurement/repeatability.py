@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from arview.cad.part import Part
+from arview.cad import Part
 from arview.core.progress import Progress
 from arview.errors import CannotMeasureError, InputError
 from arview.geometry import Array
@@ -31,7 +31,7 @@ from arview.measurement.options import MeasureOptions
 from arview.measurement.run import measure
 from arview.measurement.uncertainty.combine import quantile_of_length
 from arview.measurement.uncertainty.decision import decide
-from arview.reconstruction.types import SparseModel
+from arview.reconstruction import SparseModel
 
 BUDGET_LINE = "halves of the photos differ"
 """Name of the line of the budget for what two halves differ by beyond their U."""

@@ -12,8 +12,7 @@ import numpy as np
 import scipy.linalg  # noqa: F401  its BLAS is loaded before threads are limited
 from threadpoolctl import threadpool_limits
 
-from arview.cad.model import Model
-from arview.cad.part import Datum, Part
+from arview.cad import Datum, Model, Part
 from arview.core.checks import PATH, check_type
 from arview.core.progress import Progress
 from arview.errors import InputError
@@ -44,7 +43,7 @@ from arview.measurement.seen_from import is_mostly_hidden, seen_from, with_hidde
 from arview.measurement.types import Move, NotMeasured
 from arview.measurement.uncertainty.combine import CombinedMove
 from arview.measurement.uncertainty.pose_propagation import PosePropagation
-from arview.reconstruction.scale.cad import base_names
+from arview.reconstruction import base_names
 
 ROUGH_STD_MM = 0.3
 """Standard uncertainty of the rough frame, where neither datums nor base give a frame."""

@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
-from arview.cad.model import Model
+from arview.cad import Model
 from arview.inspection import ComponentDeviation, Finding, MeasuredPresence, Verdict
-from arview.reconstruction.coverage import DIRECTIONS_WANTED, PHOTOS_WANTED, ComponentCoverage, coverage
-from arview.reconstruction.scale.types import Consistency
-from arview.reconstruction.types import SparseModel
+from arview.reconstruction import DIRECTIONS_WANTED, PHOTOS_WANTED, ComponentCoverage, Consistency, SparseModel
+from arview.reconstruction.coverage import coverage
 
 HIDDEN_EDGES = 0.25
 """Share of the CAD's edges, beyond chance, below which most of the part is hidden."""

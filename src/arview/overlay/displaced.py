@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.cad.model import Model, make_model
+from arview.cad import Model, make_model
 from arview.camera import Camera
 from arview.geometry import Array
 from arview.overlay.edges import Edges

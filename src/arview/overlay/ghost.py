@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.cad.model import Model
+from arview.cad import Model
 from arview.camera import Camera
 from arview.core.kernel import kernel
 from arview.geometry import Array, apply
 from arview.overlay.mesh import Topology
-from arview.rendering.rasterizer import rasterise
+from arview.rendering import rasterise
 
 NEAR_MM = 1.0
 """Geometry nearer to the camera is clipped."""

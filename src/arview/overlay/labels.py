@@ -15,8 +15,7 @@ from functools import cached_property
 import numpy as np
 
 from arview.geometry import Array, apply
-from arview.inspection import ComponentDeviation, Finding, Inspection, Verdict
-from arview.inspection.rounding import decimals_of
+from arview.inspection import ComponentDeviation, Finding, Inspection, Verdict, decimals_of
 from arview.overlay.evidence import DISPLACED_RGB, MISSING_RGB, DrawnEvidence, dimmed, evidence_of
 from arview.overlay.options import DECIMALS, NEUTRAL_RGB, UNIT, VERDICT_RGB, VERDICT_WORD, OverlayOptions, Rgb
 from arview.pose import ComponentPresence

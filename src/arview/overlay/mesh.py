@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.cad.model import Component
+from arview.cad import Component
 from arview.geometry import Array
 
 _WELD_MM = 1e-4

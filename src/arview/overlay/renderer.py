@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.cad.model import Model
+from arview.cad import Model
 from arview.camera import Camera
 from arview.core.checks import check_type
 from arview.errors import MismatchError

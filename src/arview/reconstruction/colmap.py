@@ -15,8 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from arview.camera import Camera
-from arview.camera.undistort import require_brown
+from arview.camera import Camera, require_brown
 from arview.core.extras import load
 from arview.geometry import Array, rigid
 from arview.reconstruction.types import Photo, PosedPhoto, SparseModel

@@ -8,12 +8,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from arview.cad.model import Model
+from arview.cad import Model
 from arview.camera import Camera
 from arview.errors import InputError
 from arview.geometry import Array, apply, look_at
-from arview.rendering.rasterizer import rasterise
-from arview.rendering.renderers import ZBufferRenderer
+from arview.rendering import ZBufferRenderer, rasterise
 
 MAX_SIDE_PX = 400
 """Longer side of the rendered pictures; a component of 1 % of the width still has 16 px."""

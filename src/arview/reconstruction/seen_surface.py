@@ -9,11 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.cad.model import Model
+from arview.cad import Model
 from arview.camera import Camera
 from arview.errors import InputError
 from arview.geometry import Array, apply
-from arview.rendering.rasterizer import rasterise
+from arview.rendering import rasterise
 
 PIECES_ACROSS = 60
 """Pieces along the part's diameter: fine enough for a boundary of a face half seen."""

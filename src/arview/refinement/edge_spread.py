@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arview.core.kernel import kernel
-from arview.guideviews.mesh_edges import EDGE_CONTOUR, EDGE_SHARP
+from arview.guideviews import EDGE_CONTOUR, EDGE_SHARP
 from arview.refinement.kernels import nearest_view
 from arview.refinement.projection import ViewArrays, project_lines
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from arview.core.kernel import kernel
 from arview.geometry import Array
-from arview.guideviews.mesh_edges import EDGE_CONTOUR, EDGE_SHARP
+from arview.guideviews import EDGE_CONTOUR, EDGE_SHARP
 from arview.refinement.modalities.edge import EdgeProfiles
 from arview.refinement.modalities.region import RegionLines
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arview.core.kernel import kernel
-from arview.guideviews.mesh_edges import EDGE_CONTOUR, EDGE_SHARP
+from arview.guideviews import EDGE_CONTOUR, EDGE_SHARP
 from arview.refinement.evidence import edge_evidence, region_evidence
 from arview.refinement.gauss_newton import apply_twist, solve_step, trust_in
 from arview.refinement.modalities.edge import HYPOTHESES, EdgeProfiles, add_edges, measure_edges, weigh_by_color

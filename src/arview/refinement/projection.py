@@ -7,8 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.camera import Camera
-from arview.camera.undistort import require_brown
+from arview.camera import Camera, require_brown
 from arview.core.kernel import kernel
 from arview.geometry import Array
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from arview.camera import Camera
 from arview.geometry import Array
-from arview.guideviews.mesh_edges import EDGE_CONTOUR, EDGE_SHARP
+from arview.guideviews import EDGE_CONTOUR, EDGE_SHARP
 from arview.refinement.edge_spread import edge_spread
 from arview.refinement.evidence import EdgeSteps, PoseEvidence
 from arview.refinement.kernels import ModalityWeights, count_colors, run_edge_steps, run_evidence, run_stages

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from arview.core.kernel import kernel
 from arview.geometry import invert, rigid
-from arview.guideviews import GuideViewSet
-from arview.guideviews.mesh_edges import EDGE_CONTOUR, EDGE_SHARP
+from arview.guideviews import EDGE_CONTOUR, EDGE_SHARP, GuideViewSet
 from arview.refinement.modalities.shading import corner_normals, curved_share
 from arview.refinement.projection import ViewArrays
 

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.cad.model import Component, Model
+from arview.cad import Component, Model
 from arview.camera import Camera
 from arview.core.kernel import kernel
 from arview.errors import MissingDependencyError

@@ -12,7 +12,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from arview.cad.model import Model
+from arview.cad import Model
 from arview.camera import Camera
 from arview.errors import InputError
 from arview.geometry import Array, apply

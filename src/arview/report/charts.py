@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from arview import measurement
 from arview.core.figures import INK, MUTED, figure
 from arview.geometry import Array
 from arview.inspection import ComponentDeviation, DatumReport, Verdict
-from arview.measurement.cloud.distance_map import DistanceMap
 
 VERDICT_HEX = {
     Verdict.PASS: "#12805c",
@@ -116,7 +116,7 @@ def tolerance_chart(components: Sequence[ComponentDeviation]) -> str:
         return svg(made, "Share of the tolerance that each component uses")
 
 
-def histogram_chart(distances: DistanceMap) -> str:
+def histogram_chart(distances: measurement.DistanceMap) -> str:
     """Histogram of the signed distances of the cloud to the CAD model."""
     values = distances.distances
     whole = distances.statistics[0]

@@ -14,11 +14,8 @@ from markupsafe import Markup
 
 from arview.core.atomic import write_file
 from arview.errors import InputError
-from arview.inspection import ComponentDeviation, load_inspection
-from arview.inspection.fingerprint import fingerprint_of_file
-from arview.quality.decisions import Decision, RecordState, log_of, state_of_record
-from arview.quality.decisions.folder import first_inspection, photo_path, rechecks_of
-from arview.quality.decisions.table import decision_word
+from arview.inspection import ComponentDeviation, fingerprint_of_file, load_inspection
+from arview.quality import decisions
 from arview.report.evidence import ReportEvidence
 from arview.report.formatting import short_text, verdict_word
 from arview.report.rework import embedded_picture
@@ -29,7 +26,7 @@ _THUMBNAIL_PX = 360
 
 def decisions_context(evidence: ReportEvidence) -> dict[str, Any]:
     """The two parts of the page as HTML, each between its marks."""
-    return _rendered(evidence.source, state_of_record(evidence.source, evidence.inspection))
+    return _rendered(evidence.source, decisions.state_of_record(evidence.source, evidence.inspection))
 
 
 def update_report(html: str | Path, inspection: str | Path) -> bool:
@@ -56,7 +53,7 @@ def update_report(html: str | Path, inspection: str | Path) -> bool:
         raise InputError(f"{path}: cannot be read ({error})") from error
     if f'<span class="mono">{fingerprint_of_file(source)}</span>' not in page:
         return False
-    made = _rendered(source, state_of_record(source, load_inspection(source)))
+    made = _rendered(source, decisions.state_of_record(source, load_inspection(source)))
     for name in _PARTS:
         begin, end = _marks(name)
         head, found, rest = page.partition(begin)
@@ -80,8 +77,10 @@ def update_reports(target: str | Path) -> tuple[Path, ...]:
     Raises:
         InputError, OutputError: as `update_report`.
     """
-    first = first_inspection(target)
-    found = [(path.with_name("report.html"), path) for path in (first, *(path for path, _ in rechecks_of(first)))]
+    first = decisions.first_inspection(target)
+    found = [
+        (path.with_name("report.html"), path) for path in (first, *(path for path, _ in decisions.rechecks_of(first)))
+    ]
     return tuple(page for page, path in found if page.is_file() and not update_report(page, path))
 
 
@@ -89,13 +88,13 @@ def _marks(name: str) -> tuple[str, str]:
     return f"<!-- arview {name} -->", f"<!-- arview {name} end -->"
 
 
-def _rendered(source: Path, state: RecordState) -> dict[str, Any]:
+def _rendered(source: Path, state: decisions.RecordState) -> dict[str, Any]:
     import jinja2
 
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
     text = (resources.files("arview.report") / "decisions.html").read_text(encoding="utf-8")
     module: Any = environment.from_string(text).module
-    entries = log_of(source).entries()
+    entries = decisions.log_of(source).entries()
     rows = [_row(one, source) for one in entries if one.kind != "tick"]
     made = {"record": module.record(state), "decisions": module.section(state, rows, _ticks(entries), _checked(state))}
     return {
@@ -104,7 +103,7 @@ def _rendered(source: Path, state: RecordState) -> dict[str, Any]:
     }
 
 
-def _checked(state: RecordState) -> list[dict[str, str]]:
+def _checked(state: decisions.RecordState) -> list[dict[str, str]]:
     """Components before and after their rework."""
     return [
         {
@@ -121,15 +120,15 @@ def _value(one: ComponentDeviation) -> str:
     return verdict_word(one) if one.distance_mm is None else f"{verdict_word(one)}, {short_text(one)}"
 
 
-def _row(one: Decision, source: Path) -> dict[str, Any]:
+def _row(one: decisions.Decision, source: Path) -> dict[str, Any]:
     picture = None
     if one.photo:
-        path = photo_path(source, one.photo)
+        path = decisions.photo_path(source, one.photo)
         picture = None if path is None else embedded_picture(path, _THUMBNAIL_PX)
     return {
         "time": one.time.strftime("%Y-%m-%d %H:%M:%S UTC"),
         "what": "signed" if one.kind == "signature" else one.component,
-        "decision": decision_word(one),
+        "decision": decisions.decision_word(one),
         "reason": one.reason,
         "note": one.note,
         "by": one.by,
@@ -139,10 +138,10 @@ def _row(one: Decision, source: Path) -> dict[str, Any]:
     }
 
 
-def _ticks(entries: tuple[Decision, ...]) -> list[dict[str, str]]:
+def _ticks(entries: tuple[decisions.Decision, ...]) -> list[dict[str, str]]:
     """The steps of each component that are done now, and by whom."""
     latest = {(one.component, one.step): one for one in entries if one.kind == "tick"}
-    rows: dict[str, list[Decision]] = {}
+    rows: dict[str, list[decisions.Decision]] = {}
     for one in latest.values():
         if one.is_done:
             rows.setdefault(one.component, []).append(one)

@@ -7,17 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from arview.cad.part import Part
+from arview import measurement, reconstruction
+from arview.cad import Part
 from arview.errors import ArviewError, InputError
 from arview.geometry import apply, invert
-from arview.inspection import Inspection, load_inspection
-from arview.inspection.fingerprint import fingerprint_of_file
-from arview.measurement.cloud.distance_map import (
-    DistanceMap,
-    distance_map,
-    read_distance_ply,
-)
-from arview.reconstruction.types import DenseCloud, SparseModel
+from arview.inspection import Inspection, fingerprint_of_file, load_inspection
 
 
 @dataclass(frozen=True)
@@ -39,9 +33,9 @@ class ReportEvidence:
     source: Path
     sha256: str
     part: Part | None = None
-    sparse: SparseModel | None = None
-    cloud: DenseCloud | None = None
-    distances: DistanceMap | None = None
+    sparse: reconstruction.SparseModel | None = None
+    cloud: reconstruction.DenseCloud | None = None
+    distances: measurement.DistanceMap | None = None
     absent: dict[str, str] = field(default_factory=dict)
 
 
@@ -82,10 +76,8 @@ def _reconstruction(
     folder: str | Path | None,
     photos: str | Path | None,
     absent: dict[str, str],
-) -> tuple[SparseModel | None, DenseCloud | None]:
+) -> tuple[reconstruction.SparseModel | None, reconstruction.DenseCloud | None]:
     """Photos and cloud of the reconstruction, transformed to the datum frame."""
-    from arview.measurement.folder import in_model_frame, read_folder
-
     if folder is None and not (source.parent / "reconstruction.json").is_file():
         absent["sparse"] = "The folder of the reconstruction is not available (--folder), so there are no photos."
         return None, None
@@ -94,9 +86,9 @@ def _reconstruction(
         return None, None
     location = source.parent if folder is None else Path(folder)
     try:
-        found = read_folder(location, photos)
+        found = measurement.read_folder(location, photos)
         if part is not None:
-            found = in_model_frame(found, part)
+            found = measurement.in_model_frame(found, part)
         elif found.scale.model_from_scan is None:
             raise InputError("the part was located by the shape of its cloud, which needs the CAD model (--part)")
     except ArviewError as error:
@@ -115,8 +107,12 @@ def _reconstruction(
 
 
 def _distances(
-    inspection: Inspection, source: Path, part: Part | None, cloud: DenseCloud | None, absent: dict[str, str]
-) -> DistanceMap | None:
+    inspection: Inspection,
+    source: Path,
+    part: Part | None,
+    cloud: reconstruction.DenseCloud | None,
+    absent: dict[str, str],
+) -> measurement.DistanceMap | None:
     """The distances that were written beside the inspection, or those computed from cloud and CAD model."""
     report = inspection.distance_map
     if report is None:
@@ -126,9 +122,9 @@ def _distances(
         return None
     written = next((source.parent / name for name in report.files if name.endswith(".ply")), None)
     if written is not None and written.is_file():
-        return read_distance_ply(written, report.reach_mm, report.statistics)
+        return measurement.read_distance_ply(written, report.reach_mm, report.statistics)
     if cloud is not None and part is not None:
-        return distance_map(cloud, part.model, reach_mm=report.reach_mm)
+        return measurement.distance_map(cloud, part.model, reach_mm=report.reach_mm)
     absent["distances"] = (
         "The distances are not available (`arview measure` writes them beside the inspection unless --no-maps is"
         " given): only their statistics are shown."

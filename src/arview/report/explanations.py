@@ -5,9 +5,8 @@ from __future__ import annotations
 from datetime import UTC, datetime
 from typing import Any
 
-from arview.cad.part import Part
-from arview.inspection import MEASURANDS, Inspection, MethodResult
-from arview.inspection.rounding import decimals_of
+from arview.cad import Part
+from arview.inspection import MEASURANDS, Inspection, MethodResult, decimals_of
 from arview.report.formatting import NONE, determined, exact_number, number
 from arview.version import __version__
 

@@ -7,8 +7,15 @@ from __future__ import annotations
 
 from markupsafe import Markup
 
-from arview.inspection import ComponentDeviation, Finding, ForeignReport, Verdict
-from arview.inspection.rounding import decimals_beside_limit, decimals_of, exact
+from arview.inspection import (
+    ComponentDeviation,
+    Finding,
+    ForeignReport,
+    Verdict,
+    decimals_beside_limit,
+    decimals_of,
+    exact,
+)
 
 UNDETERMINED = Markup('<i class="open">undetermined</i>')
 NONE = "–"

@@ -6,8 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from arview.inspection import Inspection, Repeatability
-from arview.inspection.rounding import decimals_of
+from arview.inspection import Inspection, Repeatability, decimals_of
 from arview.report.formatting import NONE, number
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from types import NoneType
 from typing import Any
 
-from arview.cad.part import Part
+from arview.cad import Part
 from arview.core.atomic import write_file
 from arview.core.checks import PATH, check_type
 from arview.core.extras import require

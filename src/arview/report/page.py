@@ -13,13 +13,18 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
+from arview import measurement, overlay, reconstruction
 from arview.core.progress import Progress
 from arview.geometry import Array
-from arview.inspection import ComponentDeviation, Details, Inspection, Verdict
-from arview.inspection.rounding import decimals_of
-from arview.inspection.summary import overall_verdict, verdict_sentence
-from arview.measurement.cloud.distance_map import COLOR_STOPS, map_picture
-from arview.overlay.labels import by_urgency
+from arview.inspection import (
+    ComponentDeviation,
+    Details,
+    Inspection,
+    Verdict,
+    decimals_of,
+    overall_verdict,
+    verdict_sentence,
+)
 from arview.report import charts, explanations
 from arview.report.decisions import decisions_context
 from arview.report.evidence import ReportEvidence
@@ -43,7 +48,7 @@ from arview.report.scene import make_scene, scene_json
 from arview.version import __version__
 
 _FONTS = (("Inter", "400", "inter-400"), ("Inter", "600", "inter-600"), ('"Inter Greek"', "400", "inter-greek-400"))
-_GRADIENT = ", ".join(f"rgb({r:.0f} {g:.0f} {b:.0f})" for r, g, b in COLOR_STOPS)
+_GRADIENT = ", ".join(f"rgb({r:.0f} {g:.0f} {b:.0f})" for r, g, b in measurement.COLOR_STOPS)
 _PRINT_SCRIPT = (
     'addEventListener("beforeprint", () => document.querySelectorAll("details").forEach((d) => { d.open = true; }));'
 )
@@ -209,7 +214,7 @@ def _findings(evidence: ReportEvidence, gallery: Gallery) -> dict[str, Any]:
     order = {one.name: index for index, one in enumerate(inspection.components)}
     has_photos = evidence.part is not None and evidence.sparse is not None
     findings, passed = [], []
-    for one in by_urgency(inspection):
+    for one in overlay.by_urgency(inspection):
         crops = [_crop(crop) for crop in gallery.components.get(one.name, ())]
         entry = {"name": one.name, "verdict": one.verdict.value, "word": verdict_word(one)}
         if one.verdict is Verdict.PASS:
@@ -273,7 +278,7 @@ def _distance_map(evidence: ReportEvidence) -> dict[str, Any]:
         ]
     if evidence.distances is not None:
         width, legend = 1300, 110  # map_picture draws its legend there; the page has its own
-        image = map_picture(evidence.distances, limit_mm=MAP_LIMIT_MM, width=width, height=900)
+        image = measurement.map_picture(evidence.distances, limit_mm=MAP_LIMIT_MM, width=width, height=900)
         context["map"] = _embedded(_trimmed(image[:, : width - legend]), JPEG_QUALITY)
     return context
 
@@ -333,13 +338,12 @@ def _datums(inspection: Inspection) -> dict[str, Any]:
 
 def _photos(evidence: ReportEvidence) -> dict[str, Any]:
     """Reprojection errors, coverage and the list of photos."""
-    from arview.reconstruction.covariance import reprojection_residuals
     from arview.reconstruction.coverage import coverage
 
     sparse, part = evidence.sparse, evidence.part
     if sparse is None or not sparse.photos:
         return {"photo_charts": {}}
-    lengths = np.linalg.norm(reprojection_residuals(sparse), axis=1)
+    lengths = np.linalg.norm(reconstruction.reprojection_residuals(sparse), axis=1)
     centres = np.array([photo.centre_in_scan for photo in sparse.photos])
     middle = part.model.center_in_model if part is not None else np.median(sparse.points_in_scan, axis=0)
     away = np.linalg.norm(centres - middle, axis=1)

@@ -9,18 +9,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.cad.model import Model
+from arview import overlay, reconstruction
+from arview.cad import Model
 from arview.camera import Camera
 from arview.core.progress import StepProgress
 from arview.errors import InputError
 from arview.geometry import Array, apply, look_at
 from arview.inspection import ComponentDeviation, ForeignReport, Inspection, Verdict
-from arview.overlay import OverlayOptions, OverlayRenderer, paint
-from arview.overlay.labels import arrow_in_model
+from arview.overlay import paint
 from arview.pose import Pose, TrackingState
-from arview.reconstruction.intake.reading import read_photo
-from arview.reconstruction.types import PosedPhoto, SparseModel
-from arview.rendering.renderers import ZBufferRenderer
+from arview.rendering import ZBufferRenderer
 
 RgbImage = NDArray[np.uint8]
 """(H,W,3) RGB picture."""
@@ -77,7 +75,7 @@ class Gallery:
 def make_gallery(
     inspection: Inspection,
     model: Model,
-    sparse: SparseModel,
+    sparse: reconstruction.SparseModel,
     progress: StepProgress | None = None,
 ) -> Gallery:
     """Crops from the photos that show each object best: one for components that passed, else two.
@@ -104,7 +102,7 @@ def make_gallery(
         report_progress(done, len(by_photo))
         photo = sparse.photos[index]
         try:
-            image = read_photo(photo.path)
+            image = reconstruction.read_photo(photo.path)
         except InputError as error:
             unread.append(str(error))
             continue
@@ -127,16 +125,18 @@ def make_gallery(
     )
 
 
-def overview(inspection: Inspection, model: Model, sparse: SparseModel | None = None, width: int = 1440) -> RgbImage:
+def overview(
+    inspection: Inspection, model: Model, sparse: reconstruction.SparseModel | None = None, width: int = 1440
+) -> RgbImage:
     """The whole part with the overlay in the colours of the verdicts, arrows and labels, (H,W,3) uint8 RGB.
 
     The overlay is drawn over the photo that shows the part best, or, without a readable photo, on a plain background
     from the upper right.
     """
-    options = OverlayOptions(show_status=False, show_evidence=False, show_occlusion=False, max_labels=10)
+    options = overlay.OverlayOptions(show_status=False, show_evidence=False, show_occlusion=False, max_labels=10)
     for photo in _whole_views(model, sparse.photos if sparse is not None else ()):
         try:
-            image = read_photo(photo.path)
+            image = reconstruction.read_photo(photo.path)
         except InputError:
             continue
         if image.shape[:2] == (photo.camera.height, photo.camera.width):
@@ -149,11 +149,11 @@ def overview(inspection: Inspection, model: Model, sparse: SparseModel | None = 
         camera = Camera(width, height, focal, focal, 0.5 * (width - 1), 0.5 * (height - 1))
         image = np.full((height, width, 3), _BACKGROUND, dtype=np.uint8)
         pose = _whole_pose(model, camera)
-    renderer = OverlayRenderer(model, camera, inspection, options)
+    renderer = overlay.OverlayRenderer(model, camera, inspection, options)
     return renderer.draw(image, Pose(pose, None, 1.0, TrackingState.TRACKED, 0.0, 0))
 
 
-def _whole_views(model: Model, photos: Sequence[PosedPhoto]) -> list[PosedPhoto]:
+def _whole_views(model: Model, photos: Sequence[reconstruction.PosedPhoto]) -> list[reconstruction.PosedPhoto]:
     """Photos that contain the whole part, those in which it is largest first."""
     corners = _corners(model.bounds_in_model)
     views = []
@@ -180,7 +180,7 @@ def _whole_pose(model: Model, camera: Camera) -> Array:
 class _PhotoRanking:
     """How many pixels of what each photo shows."""
 
-    def __init__(self, model: Model, photos: Sequence[PosedPhoto]) -> None:
+    def __init__(self, model: Model, photos: Sequence[reconstruction.PosedPhoto]) -> None:
         self.model, self.photos = model, photos
         self.centres = np.array([photo.centre_in_scan for photo in photos]).reshape(-1, 3)
         self.pixels = np.zeros((len(photos), len(model.components)))
@@ -198,7 +198,7 @@ class _PhotoRanking:
         bounds = self.model.component(deviation.name).bounds_in_model
         score = self.pixels[:, self.model.index(deviation.name)] * self._inside(_corners(bounds))
         rays = self._rays(bounds.mean(axis=0))
-        displacement = arrow_in_model(deviation)
+        displacement = overlay.arrow_in_model(deviation)
         if displacement is not None:
             along = rays @ (np.array(displacement) / np.linalg.norm(displacement))
             score = score * np.sqrt(np.maximum(1.0 - along**2, 0.0))
@@ -254,21 +254,21 @@ def _component_crop(
     deviation: ComponentDeviation,
     inspection: Inspection,
     model: Model,
-    photo: PosedPhoto,
+    photo: reconstruction.PosedPhoto,
     image: RgbImage,
 ) -> Crop:
     """A crop with the overlay of a component at its design position and an arrow to its measured position."""
     bounds = model.component(deviation.name).bounds_in_model
     crop, camera = _cut(image, photo, _corners(bounds))
     scale: float | None = None
-    displacement = arrow_in_model(deviation)
+    displacement = overlay.arrow_in_model(deviation)
     if displacement is not None and deviation.verdict is not Verdict.PASS:
         depth = float(apply(photo.cam_from_scan, bounds.mean(axis=0)[None])[0, 2])
         longest_mm = ARROW_SHARE * camera.width * depth / camera.fx
         length_mm = float(np.linalg.norm(displacement))
         scale = float(max((s for s in _ROUND_SCALES if s * length_mm <= longest_mm), default=1))
     alone = replace(inspection, components=(deviation,), foreign_objects=())
-    drawn = OverlayOptions(
+    drawn = overlay.OverlayOptions(
         opacity=0.3,
         show_labels=False,
         show_status=False,
@@ -277,11 +277,11 @@ def _component_crop(
         arrow_scale=scale or 1.0,
     )
     pose = Pose(photo.cam_from_scan, None, 1.0, TrackingState.TRACKED, 0.0, 0)
-    picture = OverlayRenderer(model, camera, alone, drawn).draw(crop, pose)
+    picture = overlay.OverlayRenderer(model, camera, alone, drawn).draw(crop, pose)
     return Crop(picture, photo.name, scale)
 
 
-def _foreign_crop(one: ForeignReport, photo: PosedPhoto, image: RgbImage) -> Crop:
+def _foreign_crop(one: ForeignReport, photo: reconstruction.PosedPhoto, image: RgbImage) -> Crop:
     """A crop with the bounding box of a foreign object."""
     corners = np.array(one.center_mm) + 0.5 * np.array(one.size_mm) * _UNIT_CORNERS
     crop, camera = _cut(image, photo, corners)
@@ -292,7 +292,7 @@ def _foreign_crop(one: ForeignReport, photo: PosedPhoto, image: RgbImage) -> Cro
     return Crop(crop, photo.name, None)
 
 
-def _cut(image: RgbImage, photo: PosedPhoto, corners: Array) -> tuple[RgbImage, Camera]:
+def _cut(image: RgbImage, photo: reconstruction.PosedPhoto, corners: Array) -> tuple[RgbImage, Camera]:
     """The region of a photo around points (N,3), scaled to the size of a crop, and its camera."""
     pixels = photo.camera.project(apply(photo.cam_from_scan, corners))
     pixels = pixels[np.isfinite(pixels).all(axis=1)]

@@ -9,8 +9,8 @@ from typing import Any
 
 from markupsafe import Markup
 
-from arview.cad.part import Part
-from arview.quality.rework import drawing_svg, instructions
+from arview.cad import Part
+from arview.quality.rework import drawing_svg, make_instructions
 from arview.report.evidence import ReportEvidence
 
 _HOW = {
@@ -33,7 +33,7 @@ def rework_context(evidence: ReportEvidence) -> dict[str, Any]:
     if part is None:
         return {"rework": []}
     rows = []
-    for one in instructions(part, evidence.inspection):
+    for one in make_instructions(part, evidence.inspection):
         rows.append(
             {
                 "name": one.component,

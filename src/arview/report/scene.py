@@ -9,16 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.cad.model import Model
+from arview import measurement, overlay, reconstruction
+from arview.cad import Model
 from arview.geometry import Array
-from arview.inspection import Inspection
-from arview.inspection.rounding import decimals_of
-from arview.measurement.cloud.distance_map import COLOR_STOPS, DistanceMap
-from arview.measurement.cloud.mesh_surface import MeshSurface
-from arview.overlay.labels import arrow_scale
-from arview.overlay.options import OverlayOptions
+from arview.inspection import Inspection, decimals_of
 from arview.reconstruction.seen_surface import seen_surface
-from arview.reconstruction.types import DenseCloud, SparseModel
 
 _STEPS = 65535
 """Steps of the coordinates, which are stored in 16 bits over their bounding box: a metre in steps of 15 µm."""
@@ -38,9 +33,9 @@ MARGIN = 0.15
 def make_scene(
     inspection: Inspection,
     model: Model | None,
-    cloud: DenseCloud | None,
-    distances: DistanceMap | None,
-    sparse: SparseModel | None = None,
+    cloud: reconstruction.DenseCloud | None,
+    distances: measurement.DistanceMap | None,
+    sparse: reconstruction.SparseModel | None = None,
 ) -> dict[str, Any] | None:
     """The scene as a JSON object; None when there is neither CAD model nor cloud. All data are in one frame.
 
@@ -56,12 +51,12 @@ def make_scene(
     """
     if model is not None and len(model.mesh[1]) > MAX_FACES:
         model = None
-    scene: dict[str, Any] = {"stops": COLOR_STOPS.tolist(), "components": []}
+    scene: dict[str, Any] = {"stops": measurement.COLOR_STOPS.tolist(), "components": []}
     if model is not None:
         scene["mesh"] = _mesh(model)
         if sparse is not None and sparse.photos:
             scene["uncovered"] = _uncovered(model, sparse)
-        scene["arrow_scale"] = arrow_scale(inspection, model.diameter_mm, OverlayOptions())
+        scene["arrow_scale"] = overlay.arrow_scale(inspection, model.diameter_mm, overlay.OverlayOptions())
     points = _points(cloud, model, distances)
     if points is not None:
         scene["cloud"] = points
@@ -108,7 +103,7 @@ def _mesh(model: Model) -> dict[str, Any]:
     return {**_packed(vertices), "faces": _text(faces.astype("<u4")), "ranges": ranges}
 
 
-def _uncovered(model: Model, sparse: SparseModel) -> dict[str, Any]:
+def _uncovered(model: Model, sparse: reconstruction.SparseModel) -> dict[str, Any]:
     """Pieces of the surface that no two photos saw, three corners each, and their share of each component's surface."""
     surface = seen_surface(model, [(photo.camera, photo.cam_from_scan) for photo in sparse.photos])
     corners = surface.corners[~surface.is_seen].reshape(-1, 3)
@@ -116,7 +111,9 @@ def _uncovered(model: Model, sparse: SparseModel) -> dict[str, Any]:
     return {**(_packed(corners) if len(corners) else {"points": ""}), "shares": shares}
 
 
-def _points(cloud: DenseCloud | None, model: Model | None, distances: DistanceMap | None) -> dict[str, Any] | None:
+def _points(
+    cloud: reconstruction.DenseCloud | None, model: Model | None, distances: measurement.DistanceMap | None
+) -> dict[str, Any] | None:
     """A random sample of the points near the part, with colours and distances as far as they are known."""
     rng = np.random.default_rng(0)
     if cloud is not None:
@@ -142,7 +139,7 @@ def _points(cloud: DenseCloud | None, model: Model | None, distances: DistanceMa
 
 def _distances_um(points: Array, model: Model) -> NDArray[np.int16]:
     """Signed distances of the points in µm; −32768 for points far from the CAD model."""
-    closest = MeshSurface(*model.mesh).closest(points, _REACH_MM)
+    closest = measurement.MeshSurface(*model.mesh).closest(points, _REACH_MM)
     um = np.where(closest.faces >= 0, np.round(1000.0 * closest.distances).clip(-32767, 32767), -32768)
     return np.asarray(um.astype("<i2"))
 

@@ -1,9 +1,41 @@
 """Tracking: the 6-DoF pose of a part through the frames of a monocular video."""
 
-from arview.tracking.estimate import Estimate
-from arview.tracking.session import TrackingSession
-from arview.tracking.session_options import SessionOptions
-from arview.tracking.tracker import Tracker
-from arview.tracking.tracker_options import TrackerOptions
+from typing import TYPE_CHECKING
 
-__all__ = ["Estimate", "SessionOptions", "Tracker", "TrackerOptions", "TrackingSession"]
+from arview.core.doors import lazy_door
+
+if TYPE_CHECKING:
+    from arview.tracking.diagnosis import diagnose_search as diagnose_search
+    from arview.tracking.estimate import Estimate as Estimate
+    from arview.tracking.guide_pose import GUIDE_PREFIX as GUIDE_PREFIX
+    from arview.tracking.self_calibration.estimator import FocalEstimate as FocalEstimate
+    from arview.tracking.self_calibration.profile import keep_profile as keep_profile
+    from arview.tracking.self_calibration.session import MakeSession as MakeSession
+    from arview.tracking.self_calibration.session import SelfCalibratingSession as SelfCalibratingSession
+    from arview.tracking.session import TrackingSession as TrackingSession
+    from arview.tracking.session_options import SessionOptions as SessionOptions
+    from arview.tracking.several.sessions import SeveralSessions as SeveralSessions
+    from arview.tracking.several.specimens import specimen_names as specimen_names
+    from arview.tracking.tracker import Tracker as Tracker
+    from arview.tracking.tracker_options import TrackerOptions as TrackerOptions
+
+__getattr__, __dir__, __all__ = lazy_door(
+    __name__,
+    {
+        "diagnosis": ("diagnose_search",),
+        "estimate": ("Estimate",),
+        "guide_pose": ("GUIDE_PREFIX",),
+        "self_calibration.estimator": ("FocalEstimate",),
+        "self_calibration.profile": ("keep_profile",),
+        "self_calibration.session": (
+            "MakeSession",
+            "SelfCalibratingSession",
+        ),
+        "session": ("TrackingSession",),
+        "session_options": ("SessionOptions",),
+        "several.sessions": ("SeveralSessions",),
+        "several.specimens": ("specimen_names",),
+        "tracker": ("Tracker",),
+        "tracker_options": ("TrackerOptions",),
+    },
+)

@@ -14,15 +14,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.assembly.monitor import AssemblyMonitor
-from arview.assembly.observation import base_of
-from arview.cad.model import Model, make_model
+from arview.assembly import AssemblyMonitor, base_of
+from arview.cad import Model, make_model
 from arview.camera import Camera
-from arview.detection.detector import Detection, Detector, DetectorOptions, local_search_for, options_for
+from arview.detection import Detection, Detector, DetectorOptions, local_search_for, options_for
 from arview.geometry import Array, apply, rigid
-from arview.guideviews import GuideViewOptions, GuideViewSet
-from arview.guideviews.cache import cached_guide_views
-from arview.refinement.view_model import PartView
+from arview.guideviews import GuideViewOptions, GuideViewSet, cached_guide_views
+from arview.refinement import PartView
 
 MIN_QUALITY = 0.9
 """Probability below which a pose of the base is not accepted: bases are plainer than whole parts."""

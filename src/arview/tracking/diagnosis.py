@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.cad.view_range import ViewRange
-from arview.cad.viewpoint import Viewpoint, viewpoint
+from arview.cad import Viewpoint, ViewRange
+from arview.cad.viewpoint import viewpoint
 from arview.camera import Camera
-from arview.detection.detector import RejectedHypothesis
+from arview.detection import RejectedHypothesis
 from arview.geometry import Array, apply
 from arview.guideviews import GuideViewSet
 from arview.tracking.estimate import Estimate

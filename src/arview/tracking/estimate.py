@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from arview.geometry import Array
-from arview.refinement.evidence import PoseEvidence
+from arview.refinement import PoseEvidence
 
 
 @dataclass(frozen=True)

@@ -8,9 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from arview.cad.part import Guide, Part
-from arview.cad.view_range import ViewRange
-from arview.cad.viewpoint import Viewpoint, pose_at
+from arview.cad import Guide, Part, Viewpoint, ViewRange, pose_at
 from arview.camera import Camera
 from arview.errors import InputError
 from arview.geometry import Array

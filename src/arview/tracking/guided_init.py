@@ -15,17 +15,20 @@ from numpy.typing import NDArray
 
 from arview.camera import Camera
 from arview.core.parallel import pool
-from arview.detection.features.response_maps import response_maps, score_around
+from arview.detection import response_maps, score_around
 from arview.geometry import Array, apply, are_near, rotation_angle_rad, turn_ball
-from arview.guideviews import GuideViewSet
-from arview.guideviews.uniqueness import PLAIN_LINES, view_lines
-from arview.refinement.evidence import PoseEvidence
-from arview.refinement.projection import intrinsics_of
-from arview.refinement.refinement_pyramid import RefinementPyramid
-from arview.refinement.refiner import Appearance, PoseRefiner
-from arview.refinement.schedules import LAST_STAGES, SEARCH_STAGES
-from arview.refinement.view_model import PartView
-from arview.refinement.working_picture import WorkingScaleOptions
+from arview.guideviews import PLAIN_LINES, GuideViewSet, view_lines
+from arview.refinement import (
+    LAST_STAGES,
+    SEARCH_STAGES,
+    Appearance,
+    PartView,
+    PoseEvidence,
+    PoseRefiner,
+    RefinementPyramid,
+    WorkingScaleOptions,
+    intrinsics_of,
+)
 
 TURN_LIMIT_DEG = 20.0
 """Largest rotation between the given pose and an accepted one."""

@@ -17,19 +17,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arview.camera import Camera
-from arview.detection.features.image_pyramid import ImagePyramid
-from arview.detection.search.global_search import PoseCandidate
-from arview.detection.search.hypothesis import Hypothesis
-from arview.detection.search.local_search import (
+from arview.detection import (
     DISTINCT_DEG,
     FINE_SCHEDULES,
     FINE_TOLERANCE_PX,
+    Hypothesis,
+    ImagePyramid,
     LocalSearch,
     LocalSearchOptions,
+    PoseCandidate,
 )
 from arview.geometry import Array, are_near
-from arview.refinement.modalities.edge import smoothed
-from arview.refinement.schedules import SEARCH_STAGES, Stage
+from arview.refinement import SEARCH_STAGES, Stage, smoothed
 from arview.tracking.motion import squared_motion_distance
 
 WINDOW_STEP_PX = 32

@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arview.camera import Camera
-from arview.detection.detector import Detector
-from arview.detection.scene_change import SceneChange
+from arview.detection import Detector, SceneChange
 from arview.guideviews import GuideViewSet
 from arview.pose import TrackingState
 from arview.tracking.session_state import SessionState

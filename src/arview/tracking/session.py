@@ -15,17 +15,14 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.assembly.monitor import AssemblyMonitor
-from arview.assembly.turned_poses import Turn
-from arview.cad.model import Model
-from arview.camera import Camera
-from arview.camera.undistort import FrameView
+from arview.assembly import AssemblyMonitor, Turn
+from arview.cad import Model
+from arview.camera import Camera, FrameView
 from arview.core.checks import check_type
 from arview.core.parallel import single_threaded_blas
-from arview.detection.detector import Detection, Detector, RejectedHypothesis, local_search_for
-from arview.detection.search.local_search import LocalSearch
+from arview.detection import Detection, Detector, LocalSearch, RejectedHypothesis, local_search_for
 from arview.errors import MismatchError
-from arview.fiducials.serial_code import SerialNumbers
+from arview.fiducials import SerialNumbers
 from arview.geometry import Array, apply, are_near, check_rigid, invert
 from arview.guideviews import GuideViewSet
 from arview.pose import Identity, Pose, TrackingState

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from arview.detection.detector import DetectorOptions
+from arview.detection import DetectorOptions
 from arview.errors import InputError
 
 TRACKED_QUALITY = 0.5

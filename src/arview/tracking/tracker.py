@@ -17,20 +17,26 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.cad.model import Model
+from arview.cad import Model
 from arview.camera import Camera
 from arview.core.checks import check_type
 from arview.geometry import Array
 from arview.guideviews import GuideViewSet
-from arview.refinement.evidence import MIN_IN_PICTURE, quality_of
-from arview.refinement.gauss_newton import apply_twist, relative_twist
-from arview.refinement.kernels import median_brightness_ratio
-from arview.refinement.modalities.region import value_bins
-from arview.refinement.modalities.texture import TextureModality
-from arview.refinement.refinement_pyramid import RefinementPyramid
-from arview.refinement.refiner import PoseRefiner
-from arview.refinement.schedules import FAR_STAGES, LAST_STAGES, NEAR_STAGES
-from arview.refinement.view_model import PartView
+from arview.refinement import (
+    FAR_STAGES,
+    LAST_STAGES,
+    MIN_IN_PICTURE,
+    NEAR_STAGES,
+    PartView,
+    PoseRefiner,
+    RefinementPyramid,
+    TextureModality,
+    apply_twist,
+    median_brightness_ratio,
+    quality_of,
+    relative_twist,
+    value_bins,
+)
 from arview.tracking.estimate import Estimate
 from arview.tracking.motion import innovation, normalised_covariance, squared_motion_distance
 from arview.tracking.search.wide_search import WideSearch

@@ -5,10 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from arview.errors import InputError
-from arview.refinement.modalities.shading import ShadingOptions
-from arview.refinement.refiner import RefinerOptions
-from arview.refinement.schedules import TRACK_STAGES, Stage
-from arview.refinement.working_picture import WorkingScaleOptions
+from arview.refinement import TRACK_STAGES, RefinerOptions, ShadingOptions, Stage, WorkingScaleOptions
 
 STAGES: tuple[Stage, ...] = TRACK_STAGES
 """Schedule of a usual frame."""

@@ -9,12 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arview.geometry import Array
-from arview.refinement.evidence import PoseEvidence
-from arview.refinement.modalities.patch_alignment import Pyramid
-from arview.refinement.modalities.texture import TextureMatches
-from arview.refinement.refinement_pyramid import PoseScores, RefinementPyramid
-from arview.refinement.refiner import Appearance
-from arview.refinement.schedules import Stage
+from arview.refinement import Appearance, PoseEvidence, PoseScores, Pyramid, RefinementPyramid, Stage, TextureMatches
 from arview.tracking.motion import MotionModel
 
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
-from arview.camera import Camera
-from arview.camera.read import load_camera
+from arview.camera import Camera, load_camera
 from arview.errors import MismatchError
 from arview.video.pictures import PictureSource
 from arview.video.source import FrameSource

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.camera.exif import HEIF_SUFFIXES, PHOTO_SUFFIXES, check_jpeg_scans, open_picture, read_exif
+from arview.camera import HEIF_SUFFIXES, PHOTO_SUFFIXES, check_jpeg_scans, open_picture, read_exif
 from arview.core.extras import load
 from arview.errors import InputError, MissingDependencyError
 from arview.video.frame import Frame, Image

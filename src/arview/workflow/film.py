@@ -5,17 +5,12 @@ from __future__ import annotations
 from contextlib import suppress
 from pathlib import Path
 
-from arview import annotation
+from arview import annotation, guideviews, overlay, tracking
 from arview.cad import Part
-from arview.camera import Camera
-from arview.camera.read import guess_camera
+from arview.camera import Camera, guess_camera
 from arview.core.progress import StepProgress
-from arview.guideviews.cache import cached_guide_views
 from arview.inspection import Inspection
-from arview.overlay import OverlayRenderer
-from arview.tracking import TrackingSession
-from arview.video import VideoSink, open_source
-from arview.video.intrinsics import load_camera_of
+from arview.video import VideoSink, load_camera_of, open_source
 
 
 def camera_of_video(video: str, spec: str | None, of_photos: Camera | None, is_from_video: bool) -> tuple[Camera, str]:
@@ -70,14 +65,14 @@ def make_film(
         OutputError: a file cannot be written.
     """
     unfinished = film.with_name(f".unfinished.{film.name}"), poses.with_name(f".unfinished.{poses.name}")
-    views = cached_guide_views(part.model, part.effective_view_range)
+    views = guideviews.cached_guide_views(part.model, part.effective_view_range)
     try:
         with open_source(video) as frames:
             total = frames.frame_count or 0
             summary = annotation.annotate(
                 frames,
-                TrackingSession(views, camera, part.model),
-                OverlayRenderer(part.model, camera, inspection),
+                tracking.TrackingSession(views, camera, part.model),
+                overlay.OverlayRenderer(part.model, camera, inspection),
                 VideoSink(unfinished[0], frames.width, frames.height, frames.fps, frames),
                 unfinished[1],
                 progress=lambda done, pose: progress(done, total),

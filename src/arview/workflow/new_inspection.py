@@ -7,19 +7,17 @@ from datetime import UTC, datetime
 
 import numpy as np
 
-from arview.acceptance.position_list import ListedComponent
-from arview.cad.part import Part
+from arview import acceptance, measurement
+from arview.cad import Part
 from arview.errors import InputError
 from arview.inspection import ComponentDeviation, Details, Inspection, Provenance, Verdict
-from arview.measurement.measurand import measurand_of
-from arview.measurement.uncertainty.decision import decide
 from arview.version import __version__
 
 _NOTHING = (False, False, False, False, False, False)
 
 
 def new_inspection(
-    part: Part, listed: Sequence[ListedComponent] = (), serial: str | None = None, label: str = ""
+    part: Part, listed: Sequence[acceptance.ListedComponent] = (), serial: str | None = None, label: str = ""
 ) -> Inspection:
     """An inspection of the part's inspected components, with the values of a list where it has them.
 
@@ -52,9 +50,9 @@ def new_inspection(
     )
 
 
-def _component(part: Part, name: str, value: ListedComponent | None, label: str) -> ComponentDeviation:
+def _component(part: Part, name: str, value: acceptance.ListedComponent | None, label: str) -> ComponentDeviation:
     tolerance_mm = part.component_settings(name).position_tolerance_mm
-    measurand = measurand_of(name, part)
+    measurand = measurement.measurand_of(name, part)
     center = measurand.point_in_model
     details = Details((float(center[0]), float(center[1]), float(center[2])), measurand.kind)
     moved = np.full(3, np.nan)
@@ -69,7 +67,7 @@ def _component(part: Part, name: str, value: ListedComponent | None, label: str)
     distance = float(np.linalg.norm(moved[known]))
     along = moved[known] / distance if distance > 0.0 else np.full(int(known.sum()), known.sum() ** -0.5)
     uncertainty = float(np.sqrt(((along * value.uncertainty[known]) ** 2).sum()))
-    verdict = decide(distance, uncertainty, tolerance_mm)
+    verdict = measurement.decide(distance, uncertainty, tolerance_mm)
     if verdict is Verdict.PASS and not known.all():
         verdict = Verdict.UNDECIDED  # a displacement along the undetermined axis would enlarge the distance
     dx, dy, dz = (float(one) if is_known else None for one, is_known in zip(moved, known, strict=True))

@@ -5,24 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from arview import measurement, reconstruction
 from arview.cad import Part, load_part
-from arview.camera.read import load_camera, split_spec
+from arview.camera import load_camera, split_spec
 from arview.core.stage_cache import content_key, key_of
 from arview.errors import InputError
-from arview.measurement.options import MeasureOptions
-from arview.measurement.uncertainty.decision import DecisionOptions
-from arview.reconstruction.dense import DenseOptions
-from arview.reconstruction.given_poses import read_poses
-from arview.reconstruction.intake import VideoIntakeOptions
-from arview.reconstruction.intake.reading import photo_paths
-from arview.reconstruction.pairs import KnownPairs, read_pairs
-from arview.reconstruction.part_masks import AUTO
-from arview.reconstruction.run import ReconstructOptions
-from arview.reconstruction.scale import ScaleSources, load_scale_file
-from arview.reconstruction.sparse import SparseOptions
 from arview.version import __version__
-from arview.video import open_source
-from arview.video.intrinsics import load_camera_of
+from arview.video import load_camera_of, open_source
 from arview.workflow.job import InspectJob
 from arview.workflow.silhouettes import CadSilhouettes
 
@@ -33,8 +22,8 @@ class Prepared:
 
     job: InspectJob
     part: Part
-    reconstruct: ReconstructOptions
-    measure: MeasureOptions
+    reconstruct: reconstruction.ReconstructOptions
+    measure: measurement.MeasureOptions
 
 
 def prepare(job: InspectJob, folder: Path) -> Prepared:
@@ -54,30 +43,32 @@ def prepare(job: InspectJob, folder: Path) -> Prepared:
     if job.photos:
         if Path(job.photos).is_dir() and folder.resolve() == Path(job.photos).resolve():
             raise InputError(f"{folder}: is the folder of the photos; give another one for the results")
-        photo_paths(job.photos)
+        reconstruction.photo_paths(job.photos)
     part = load_part(job.part, job.unit)
     if job.serial is not None:
         part = replace(part, serial=job.serial)
     if not part.inspected:
         raise InputError(f"part {part.name!r}: no component has the role 'inspect'")
-    if job.masks and job.masks != AUTO and not Path(job.masks).is_dir():
+    if job.masks and job.masks != reconstruction.AUTO and not Path(job.masks).is_dir():
         raise InputError(f"{job.masks}: no such folder; give the folder of the masks, or auto")
     if job.sparse:
-        read_poses(job.sparse)
+        reconstruction.read_poses(job.sparse)
     _check_cameras(job)
     threads, seed = job.threads, job.seed
-    reconstruct = ReconstructOptions(
-        video=VideoIntakeOptions(max_frames=job.max_frames),
-        sparse=SparseOptions(seed=seed, threads=threads, device=job.device),
-        sources=load_scale_file(job.scale_file) if job.scale_file else ScaleSources(),
-        dense=DenseOptions(seed=seed, threads=threads, device=job.device),
+    reconstruct = reconstruction.ReconstructOptions(
+        video=reconstruction.VideoIntakeOptions(max_frames=job.max_frames),
+        sparse=reconstruction.SparseOptions(seed=seed, threads=threads, device=job.device),
+        sources=reconstruction.load_scale_file(job.scale_file) if job.scale_file else reconstruction.ScaleSources(),
+        dense=reconstruction.DenseOptions(seed=seed, threads=threads, device=job.device),
         poses=Path(job.sparse) if job.sparse else None,
-        masks=Path(job.masks) if job.masks and job.masks != AUTO else None,
-        silhouettes=CadSilhouettes(part) if job.masks == AUTO else None,
-        known=read_pairs(job.pairs) if job.pairs else KnownPairs(),
+        masks=Path(job.masks) if job.masks and job.masks != reconstruction.AUTO else None,
+        silhouettes=CadSilhouettes(part) if job.masks == reconstruction.AUTO else None,
+        known=reconstruction.read_pairs(job.pairs) if job.pairs else reconstruction.KnownPairs(),
     )
-    measure = MeasureOptions(
-        tolerance_mm=job.tolerance_mm, maps_folder=folder / "inspection_distances", decision=DecisionOptions(job.guard)
+    measure = measurement.MeasureOptions(
+        tolerance_mm=job.tolerance_mm,
+        maps_folder=folder / "inspection_distances",
+        decision=measurement.DecisionOptions(job.guard),
     )
     return Prepared(job, part, reconstruct, measure)
 
@@ -101,11 +92,13 @@ def measurement_key(prepared: Prepared) -> str:
     """A hash of everything that the measurement depends on, by content and independent of paths."""
     job, part, options = prepared.job, prepared.part, prepared.measure
     source = Path(job.photo_source)
-    photos = [source] if source.is_file() else photo_paths(job.photo_source)[0]
+    photos = [source] if source.is_file() else reconstruction.photo_paths(job.photo_source)[0]
     reconstruct = prepared.reconstruct
     masks = [] if reconstruct.masks is None else sorted(reconstruct.masks.rglob("*.png"))
     made = None if reconstruct.silhouettes is None else reconstruct.silhouettes.key()
-    poses = [(one.name, one.cam_from_scan.tolist()) for one in read_poses(job.sparse)] if job.sparse else []
+    poses = (
+        [(one.name, one.cam_from_scan.tolist()) for one in reconstruction.read_poses(job.sparse)] if job.sparse else []
+    )
     return key_of(
         content_key(photos),
         content_key(masks),

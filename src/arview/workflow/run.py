@@ -18,15 +18,13 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from arview import measurement, reconstruction
 from arview.core.checks import PATH, check_type
 from arview.core.extras import require
 from arview.core.progress import Progress
 from arview.core.stage_cache import Stages, content_key, key_of
 from arview.errors import CannotMeasureError, InputError, MismatchError, MissingDependencyError
-from arview.inspection import Inspection, Verdict, load_inspection, save_inspection
-from arview.inspection.summary import overall_verdict, verdict_sentence
-from arview.reconstruction.memory import SparseMemory
-from arview.reconstruction.run import Reconstruction, reconstruct
+from arview.inspection import Inspection, Verdict, load_inspection, overall_verdict, save_inspection, verdict_sentence
 from arview.version import __version__
 from arview.workflow.film import camera_of_video, make_film
 from arview.workflow.halves import with_halves
@@ -122,7 +120,7 @@ def inspect_prepared(
     *,
     progress: Progress | None = None,
     starts_over: bool = False,
-    memory: SparseMemory | None = None,
+    memory: reconstruction.SparseMemory | None = None,
     on_verdict: Callable[[Inspection], None] | None = None,
 ) -> Outcome:
     """Inspect one part as `inspect_part` does, from inputs that are read and checked.
@@ -149,7 +147,7 @@ class _InspectionRun:
     """One run: its inputs, and the stages and warnings so far."""
 
     def __init__(
-        self, prepared: Prepared, folder: Path, progress: Progress, memory: SparseMemory | None = None
+        self, prepared: Prepared, folder: Path, progress: Progress, memory: reconstruction.SparseMemory | None = None
     ) -> None:
         self.prepared, self.folder, self.progress, self.memory = prepared, folder, progress, memory
         self.stages = Stages(folder)
@@ -182,11 +180,11 @@ class _InspectionRun:
             _peak_memory_mb(),
         )
 
-    def _reconstruct(self, starts_over: bool) -> Reconstruction:
+    def _reconstruct(self, starts_over: bool) -> reconstruction.Reconstruction:
         prepared, job = self.prepared, self.prepared.job
         options = replace(prepared.reconstruct, starts_over=starts_over)
         with _measuring():
-            found = reconstruct(
+            found = reconstruction.reconstruct(
                 job.photo_source,
                 self.folder,
                 prepared.part,
@@ -208,7 +206,7 @@ class _InspectionRun:
         options = replace(prepared.reconstruct, starts_over=starts_over, last_stage="scale")
         if self.stages.key("measure") is None or starts_over:
             with _measuring():
-                found = reconstruct(
+                found = reconstruction.reconstruct(
                     job.photo_source,
                     self.folder,
                     prepared.part,
@@ -228,12 +226,10 @@ class _InspectionRun:
         part, path = self.prepared.part, self.folder / "inspection.json"
 
         def work() -> str:
-            from arview.measurement.folder import read_folder
-            from arview.measurement.run import measure
 
             with _measuring():
-                found = read_folder(self.folder)
-                inspection = measure(found, part, self.prepared.measure, progress=self.progress)
+                found = measurement.read_folder(self.folder)
+                inspection = measurement.measure(found, part, self.prepared.measure, progress=self.progress)
             if self.prepared.job.compares_halves:
                 inspection = with_halves(inspection, found, self.folder, self.prepared, self.progress)
             save_inspection(inspection, path)
@@ -264,7 +260,7 @@ class _InspectionRun:
             pdf.unlink(missing_ok=True)
         self._once("report", "report", key, [html, pdf] if wants_pdf else [html], work)
 
-    def _film(self, found: Reconstruction, inspection: Inspection) -> None:
+    def _film(self, found: reconstruction.Reconstruction, inspection: Inspection) -> None:
         part, job = self.prepared.part, self.prepared.job
         film, poses = self.folder / "annotated.mp4", self.folder / "poses.jsonl"
         video = job.video
@@ -317,23 +313,20 @@ class _InspectionRun:
         self.records.append(StageRecord(title, "done", time.perf_counter() - began, note))
 
 
-def measured_in_photos(found: Reconstruction, prepared: Prepared, progress: Progress) -> Inspection:
+def measured_in_photos(found: reconstruction.Reconstruction, prepared: Prepared, progress: Progress) -> Inspection:
     """The measurement of a reconstruction by sweep and edges, without a cloud.
 
     Raises:
         CannotMeasureError: the reconstruction has no frame, contradicts the CAD, or does not show the datums.
     """
-    from arview.measurement.folder import MetricReconstruction, read_folder
-    from arview.measurement.run import measure
-
     methods = tuple(one for one in prepared.measure.methods if one != "cloud")
     options = replace(prepared.measure, methods=methods, maps_folder=None)
     with _measuring():
         if found.sparse is None or found.scale is None or found.scale.model_from_scan is None:
-            metric = read_folder(found.folder, with_cloud=False)  # which says what is missing
+            metric = measurement.read_folder(found.folder, with_cloud=False)  # which says what is missing
         else:
-            metric = MetricReconstruction(found.sparse, found.scale, None)
-        return measure(metric, prepared.part, options, progress=progress)
+            metric = measurement.MetricReconstruction(found.sparse, found.scale, None)
+        return measurement.measure(metric, prepared.part, options, progress=progress)
 
 
 @contextmanager
@@ -345,7 +338,7 @@ def _measuring() -> Iterator[None]:
         raise CannotMeasureError(str(error)) from error
 
 
-def _about(found: Reconstruction, stage: str) -> str:
+def _about(found: reconstruction.Reconstruction, stage: str) -> str:
     """Summary of a stage of the reconstruction."""
     sparse, scale, quality = found.sparse, found.scale, found.quality
     if stage == "photos":

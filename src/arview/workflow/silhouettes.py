@@ -15,22 +15,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.cad import Part
-from arview.cad.model import Model
+from arview import guideviews, reconstruction
+from arview.cad import Model, Part
 from arview.camera import Camera
 from arview.core.progress import Progress
 from arview.core.stage_cache import key_of
 from arview.detection import Detector
 from arview.errors import OutputError
 from arview.geometry import Array, apply
-from arview.guideviews import GuideViewOptions
-from arview.guideviews.cache import cached_guide_views
-from arview.reconstruction.intake.reading import read_photo
-from arview.reconstruction.part_masks import PartMasks
-from arview.reconstruction.scale import CadOptions, find_scale
-from arview.reconstruction.scale.cad import DETECT_WIDTH_PX, SPANS, SUBDIVISIONS, search_ranges, shrunk
-from arview.reconstruction.types import Photo, SparseModel
-from arview.rendering.rasterizer import rasterise
+from arview.rendering import rasterise
 from arview.version import __version__
 
 MARGIN_MM = 10.0
@@ -41,7 +34,7 @@ MAX_SIDE_PX = 1000
 """Longer side of the masks; they are scaled to their photos."""
 MAX_STRETCH = 3.0
 """Largest field of the undistorted view, relative to the photo."""
-ROUGH = CadOptions(max_views=6, rival_views=4, max_side_px=800)
+ROUGH = reconstruction.CadOptions(max_views=6, rival_views=4, max_side_px=800)
 """Rough placing is enough, because the margin covers its error."""
 
 
@@ -63,23 +56,27 @@ class CadSilhouettes:
         """A hash of the part, the options and the version."""
         return key_of("auto", self.part.model.source_hash, self.part.effective_view_range, self.options, __version__)
 
-    def at_poses(self, sparse: SparseModel, folder: Path, tell: Progress) -> PartMasks:
+    def at_poses(self, sparse: reconstruction.SparseModel, folder: Path, tell: Progress) -> reconstruction.PartMasks:
         """Masks of the placed photos in which the part is; none if it is not found, or contradicts the poses."""
-        found = find_scale(sparse, self.part, options=ROUGH, progress=tell)
+        found = reconstruction.find_scale(sparse, self.part, options=ROUGH, progress=tell)
         if found.scale is None or found.model_from_scan is None:
-            return PartMasks(f"the CAD was not found at the poses of the photos ({found.why_no_frame})")
+            return reconstruction.PartMasks(f"the CAD was not found at the poses of the photos ({found.why_no_frame})")
         metric = sparse.transformed(found.scale, found.model_from_scan)
         poses = {photo.name: (photo.camera, photo.cam_from_scan) for photo in metric.photos}
         return self._written(poses, folder, MARGIN_MM)
 
-    def in_photos(self, photos: Sequence[Photo], folder: Path, tell: Progress) -> PartMasks:
+    def in_photos(
+        self, photos: Sequence[reconstruction.Photo], folder: Path, tell: Progress
+    ) -> reconstruction.PartMasks:
         """Masks of the photos in which the part is found, each by itself."""
         poses: dict[str, tuple[Camera, Array]] = {}
-        for view_range in search_ranges(self.part, [photo.camera for photo in photos], SPANS):
-            views = cached_guide_views(
+        for view_range in reconstruction.search_ranges(
+            self.part, [photo.camera for photo in photos], reconstruction.SPANS
+        ):
+            views = guideviews.cached_guide_views(
                 self.part.model,
                 view_range,
-                GuideViewOptions(subdivisions=SUBDIVISIONS),
+                guideviews.GuideViewOptions(subdivisions=reconstruction.SUBDIVISIONS),
                 progress=lambda done, total: tell("guide views", done, total),
             )
             detectors: dict[str, Detector] = {}
@@ -87,7 +84,9 @@ class CadSilhouettes:
                 tell("finding the part", done, len(photos))
                 if photo.name in poses:
                     continue
-                camera, image = shrunk(photo.camera, read_photo(photo.path), DETECT_WIDTH_PX)
+                camera, image = reconstruction.shrunk(
+                    photo.camera, reconstruction.read_photo(photo.path), reconstruction.DETECT_WIDTH_PX
+                )
                 key = key_of(camera)
                 if key not in detectors:
                     detectors[key] = Detector(views, camera)
@@ -98,7 +97,9 @@ class CadSilhouettes:
                 break
         return self._written(poses, folder, PLACING_MARGIN_MM)
 
-    def _written(self, poses: dict[str, tuple[Camera, Array]], folder: Path, margin_mm: float) -> PartMasks:
+    def _written(
+        self, poses: dict[str, tuple[Camera, Array]], folder: Path, margin_mm: float
+    ) -> reconstruction.PartMasks:
         """The masks at poses ``cam_from_model``, as files; photos in which nothing of the part is seen have none."""
         options = self.options if margin_mm > 0.0 else replace(self.options, edge_px=0.0)
         masks: dict[str, Path] = {}
@@ -117,10 +118,10 @@ class CadSilhouettes:
         except OSError as error:
             raise OutputError(f"{folder}: cannot be written to ({error.strerror or error})") from error
         if not masks:
-            return PartMasks("the part was found in none of the photos")
+            return reconstruction.PartMasks("the part was found in none of the photos")
         area = f"{100 * float(np.median(shares)):.0f} % of their area"
         margin = f" or within {margin_mm:.0f} mm of it" if margin_mm > 0.0 else ""
-        return PartMasks(f"{len(masks)} photos, where the part is{margin} ({area})", masks)
+        return reconstruction.PartMasks(f"{len(masks)} photos, where the part is{margin} ({area})", masks)
 
 
 def silhouette_mask(

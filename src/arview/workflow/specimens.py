@@ -5,18 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
+from arview import guideviews, overlay, tracking
 from arview.errors import InputError
 
 if TYPE_CHECKING:
     from arview.cad import Part
     from arview.camera import Camera
-    from arview.fiducials.serial_code import SerialNumbers
-    from arview.guideviews import GuideViewSet
+    from arview.fiducials import SerialNumbers
     from arview.inspection import Inspection
-    from arview.overlay import OverlayOptions
-    from arview.overlay.several import SeveralOverlay
-    from arview.tracking import SessionOptions
-    from arview.tracking.several.sessions import SeveralSessions
 
 
 class Specimen(NamedTuple):
@@ -29,7 +25,7 @@ class Specimen(NamedTuple):
     @property
     def serials(self) -> SerialNumbers | None:
         """Serial number that a code on the specimen must hold; None where neither part nor inspection says one."""
-        from arview.fiducials.serial_code import SerialNumbers
+        from arview.fiducials import SerialNumbers
 
         inspected = None if self.inspection is None else self.inspection.serial
         return SerialNumbers.expected(inspected, self.part.serial, self.part.serial_pattern)
@@ -51,7 +47,6 @@ def load_specimens(
     """
     from arview.cad import load_part
     from arview.inspection import load_inspection
-    from arview.tracking.several.specimens import specimen_names
 
     parts = [part for path in part_paths for part in [load_part(path, unit)] * instances]
     if len(inspection_paths) > len(parts):
@@ -61,40 +56,36 @@ def load_specimens(
         )
     found = [load_inspection(path, part.model) for path, part in zip(inspection_paths, parts, strict=False)]
     inspections = [*found, *[None] * (len(parts) - len(found))]
-    names = specimen_names([part.name for part in parts])
+    names = tracking.specimen_names([part.name for part in parts])
     return [Specimen(*of) for of in zip(names, parts, inspections, strict=True)]
 
 
 def make_sessions(
     specimens: Sequence[Specimen],
-    views_of: Callable[[Part], GuideViewSet],
+    views_of: Callable[[Part], guideviews.GuideViewSet],
     camera: Camera,
-    options: SessionOptions,
-) -> SeveralSessions:
+    options: tracking.SessionOptions,
+) -> tracking.SeveralSessions:
     """A session for each specimen; those of one part share guide views and detector."""
-    from arview.tracking import TrackingSession
-    from arview.tracking.several.sessions import SeveralSessions
-
-    first: dict[str, TrackingSession] = {}
+    first: dict[str, tracking.TrackingSession] = {}
     sessions = {}
     for specimen in specimens:
         part = specimen.part
         like = first.get(part.model.source_hash)
         views = views_of(part) if like is None else like.views
-        session = TrackingSession(views, camera, part.model, options, like=like, serials=specimen.serials)
+        session = tracking.TrackingSession(views, camera, part.model, options, like=like, serials=specimen.serials)
         first.setdefault(part.model.source_hash, session)
         sessions[specimen.name] = session
-    return SeveralSessions(sessions)
+    return tracking.SeveralSessions(sessions)
 
 
-def make_overlay(specimens: Sequence[Specimen], options: OverlayOptions, camera: Camera) -> SeveralOverlay:
+def make_overlay(
+    specimens: Sequence[Specimen], options: overlay.OverlayOptions, camera: Camera
+) -> overlay.SeveralOverlay:
     """The drawing of all specimens in one picture."""
-    from arview.overlay import OverlayRenderer
-    from arview.overlay.several import SeveralOverlay
-
-    return SeveralOverlay(
+    return overlay.SeveralOverlay(
         {
-            name: OverlayRenderer(part.model, camera, inspection, options, serial=part.serial)
+            name: overlay.OverlayRenderer(part.model, camera, inspection, options, serial=part.serial)
             for name, part, inspection in specimens
         }
     )

@@ -15,7 +15,7 @@ from arview.cad.view_range import Up
 from arview.errors import MismatchError
 from arview.geometry import Array, apply, exp_so3, rigid
 from arview.inspection import ComponentDeviation, Details, Verdict
-from arview.quality.rework import Instruction, instruction_document, instructions
+from arview.quality.rework import Instruction, instruction_document, make_instructions
 from helpers.inspections import deviation, inspection, missing, not_measured
 from helpers.paths import SAMPLES
 from helpers.rework_part import UP, off, wall
@@ -24,7 +24,7 @@ WALL = wall()
 
 
 def told(part: Part, *components: ComponentDeviation) -> tuple[Instruction, ...]:
-    return instructions(part, inspection(part.model, components))
+    return make_instructions(part, inspection(part.model, components))
 
 
 def total(one: Instruction) -> Array:
@@ -181,7 +181,7 @@ def test_missing_components_are_no_direction() -> None:
 
 def test_only_what_fails_is_reworked() -> None:
     center = WALL.model.component("east").centroid_in_model
-    found = instructions(
+    found = make_instructions(
         WALL,
         inspection(
             WALL.model,
@@ -269,7 +269,7 @@ def test_the_document_has_the_numbers() -> None:
 def test_an_inspection_of_another_model_is_refused() -> None:
     other = wall("y")
     with pytest.raises(MismatchError):
-        instructions(WALL, inspection(other.model, (off(other, "block_1", (2.0, 0.0, 0.0)),)))
+        make_instructions(WALL, inspection(other.model, (off(other, "block_1", (2.0, 0.0, 0.0)),)))
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""Many idle connections of one address stop nobody; unfinished handshakes end; the token makes a connection a guest."""
+"""Many idle connections of one address stop nobody; unfinished handshakes end; the token authenticates a connection."""
 
 from __future__ import annotations
 
@@ -39,25 +39,27 @@ def limit(monkeypatch: pytest.MonkeyPatch, **limits: float) -> None:
         monkeypatch.setattr(connections, name, value)
 
 
-def test_strangers_make_room_for_each_other_and_guests_stay(monkeypatch: pytest.MonkeyPatch) -> None:
-    limit(monkeypatch, STRANGERS_OF_ADDRESS=4, MAX_STRANGERS=10, HANDSHAKES_BURST=1e6)
+def test_unauthenticated_make_room_for_each_other_and_authenticated_stay(monkeypatch: pytest.MonkeyPatch) -> None:
+    limit(monkeypatch, UNAUTHENTICATED_PER_ADDRESS=4, MAX_UNAUTHENTICATED=10, HANDSHAKES_BURST=1e6)
     table = ConnectionTable()
     closed: list[tuple[str, int]] = []
     assert admitted(table, "a", range(4), closed) == 4 and not closed
     table.show_token(("a", 0))
     assert admitted(table, "a", range(4, 7), closed) == 3
-    assert closed == [("a", 1), ("a", 2)] and table.guests == 1 and table.strangers == 4
+    assert closed == [("a", 1), ("a", 2)] and table.authenticated == 1 and table.unauthenticated == 4
     assert admitted(table, "b", range(4), closed) == 4 and admitted(table, "c", range(2), closed) == 2
     closed.clear()
     assert admitted(table, "d", range(1), closed) == 1  # full: the oldest of the address that has the most
-    assert len(closed) == 1 and closed[0][0] in "ab" and table.strangers == 10
+    assert len(closed) == 1 and closed[0][0] in "ab" and table.unauthenticated == 10
     table.remove(("a", 0))
     table.remove(("nobody", 1))
-    assert table.guests == 0
+    assert table.authenticated == 0
 
 
-def test_new_connections_of_one_address_are_rated_and_guests_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
-    limit(monkeypatch, HANDSHAKES_PER_S=0.1, HANDSHAKES_BURST=5, MAX_GUESTS=2)
+def test_new_connections_of_one_address_are_rated_and_authenticated_are_counted(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    limit(monkeypatch, HANDSHAKES_PER_S=0.1, HANDSHAKES_BURST=5, MAX_AUTHENTICATED=2)
     table = ConnectionTable()
     closed: list[tuple[str, int]] = []
     assert admitted(table, "a", range(20), closed) == 5 and admitted(table, "b", range(1), closed) == 1
@@ -67,7 +69,7 @@ def test_new_connections_of_one_address_are_rated_and_guests_are_counted(monkeyp
     with pytest.raises(Refusal, match="too many connections"):
         table.show_token(("a", 2))
     table.close_all()
-    assert len(closed) == 6 and table.guests == table.strangers == 0
+    assert len(closed) == 6 and table.authenticated == table.unauthenticated == 0
 
 
 @contextmanager
@@ -134,7 +136,7 @@ def test_idle_connections_of_one_address_stop_nobody(
             except OSError:
                 pass
             line.close()
-        assert 1 <= open_lines <= connections.STRANGERS_OF_ADDRESS
+        assert 1 <= open_lines <= connections.UNAUTHENTICATED_PER_ADDRESS
         assert time.monotonic() - began_s < 20
         before.close()
         new.close()

@@ -190,8 +190,8 @@ def fuzz_requests(folder: Path) -> tuple[Callable[[Any], None], st.SearchStrateg
         requests=RequestLimits(
             per_s=1e9,
             burst=1e9,
-            strangers_per_s=1e9,
-            strangers_burst=1e9,
+            unauthenticated_per_s=1e9,
+            unauthenticated_burst=1e9,
             joins_per_s=1e9,
             joins_burst=1e9,
             images_per_s=1e9,

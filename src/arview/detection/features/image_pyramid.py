@@ -21,8 +21,7 @@ from arview.detection.features.response_maps import (
     response_maps,
 )
 from arview.geometry import Array
-from arview.refinement.modalities.edge import smoothed
-from arview.refinement.projection import intrinsics_of
+from arview.refinement import intrinsics_of, smoothed
 
 STEPS_PER_OCTAVE = 4
 """Scale steps per factor of two; also the spacing of the template distances."""

@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 
 from arview.core.kernel import kernel
 from arview.geometry import Array
-from arview.guideviews.mesh_edges import EDGE_CONTOUR, EDGE_SHARP
-from arview.refinement.kernels import nearest_view
-from arview.refinement.projection import ViewArrays, project_lines
+from arview.guideviews import EDGE_CONTOUR, EDGE_SHARP
+from arview.refinement import ViewArrays, nearest_view, project_lines
 
 Channel = NDArray[np.float32]
 

@@ -21,8 +21,7 @@ from arview.detection.scoring.crops import MASK, write_relative_colours
 from arview.detection.scoring.profile_ranker import sample_lines
 from arview.detection.scoring.score_net import REFERENCE_RADIUS_PX, NetworkInput, ScoreNet, size_and_contrast
 from arview.geometry import Array
-from arview.refinement.projection import ViewArrays, project_lines
-from arview.refinement.view_model import PartView
+from arview.refinement import PartView, ViewArrays, project_lines
 
 OUTLINE_ROWS, INNER_ROWS = 96, 48
 """Maximum numbers of profiles across the outline and across design edges inside it."""

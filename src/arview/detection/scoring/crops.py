@@ -18,11 +18,8 @@ from arview.core.kernel import kernel
 from arview.detection.features.edge_net import SOLID_CHANNEL
 from arview.detection.features.image_pyramid import ImagePyramid, steps_to
 from arview.geometry import Array
-from arview.guideviews.mesh_edges import EDGE_CONTOUR, EDGE_SHARP
-from arview.guideviews.surface import draw_surface
-from arview.refinement.kernels import nearest_view
-from arview.refinement.projection import ViewArrays, project_lines
-from arview.refinement.view_model import PartView
+from arview.guideviews import EDGE_CONTOUR, EDGE_SHARP, draw_surface
+from arview.refinement import PartView, ViewArrays, nearest_view, project_lines
 
 CROP_SIDE_PX, CROP_RADIUS_PX = 80, 35.0
 """Side of the crop around a pose, and half the part's diameter in it."""

@@ -27,7 +27,7 @@ from arview.detection.scoring.crops import (
     normalise_colours,
 )
 from arview.geometry import Array
-from arview.refinement.view_model import PartView
+from arview.refinement import PartView
 from arview.weights import load_network
 
 PAIR_SIDE_PX, PAIR_RADIUS_PX = 128, 54.0

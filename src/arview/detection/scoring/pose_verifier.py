@@ -23,7 +23,7 @@ from arview.detection.scoring.crops import (
 )
 from arview.detection.scoring.score_net import REFERENCE_RADIUS_PX, NetworkInput, ScoreNet, size_and_contrast
 from arview.geometry import Array
-from arview.refinement.view_model import PartView
+from arview.refinement import PartView
 
 POSE_SCALARS = 6
 """Scalar inputs: size, contrast, evidence logit, profile score, scatter, and the share of brightness explained."""

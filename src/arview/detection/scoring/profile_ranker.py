@@ -22,10 +22,8 @@ from arview.core.parallel import pool
 from arview.detection.features.edge_net import SOLID_CHANNEL
 from arview.detection.features.image_pyramid import ImagePyramid, PyramidLevel, steps_to
 from arview.geometry import Array
-from arview.guideviews.mesh_edges import EDGE_CONTOUR, EDGE_SHARP
-from arview.refinement.kernels import nearest_view
-from arview.refinement.projection import ViewArrays, project_lines
-from arview.refinement.view_model import PartView
+from arview.guideviews import EDGE_CONTOUR, EDGE_SHARP
+from arview.refinement import PartView, ViewArrays, nearest_view, project_lines
 from arview.weights import load_arrays
 
 ROUGH, FINE = ("rough",), ("fine", "close")

@@ -36,7 +36,7 @@ from arview.detection.search.template_bank import (
 from arview.detection.search.template_matching import TYPICAL_SHARE, decimate, decimate_with_border, match_templates
 from arview.geometry import Array, rigid, turns_to_rays
 from arview.guideviews import GuideViewSet
-from arview.refinement.view_model import PartView
+from arview.refinement import PartView
 
 
 @dataclass(frozen=True)

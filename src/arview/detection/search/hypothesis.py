@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from arview.detection.confidence import appearance_score, confidence_weights, evidence_logit
 from arview.geometry import Array
-from arview.refinement.evidence import PoseEvidence
+from arview.refinement import PoseEvidence
 
 
 @dataclass(frozen=True)

@@ -33,11 +33,16 @@ from arview.detection.search.polish import polish
 from arview.detection.search.template_bank import ViewLineCounts
 from arview.geometry import Array, are_near, exp_so3, rigid
 from arview.guideviews import GuideViewSet
-from arview.refinement.evidence import DECISION_SCORE, PoseEvidence
-from arview.refinement.refiner import PoseRefiner
-from arview.refinement.schedules import NEAR_STAGES, SEARCH_STAGES, Stage
-from arview.refinement.view_model import PartView
-from arview.refinement.working_picture import WorkingScaleOptions
+from arview.refinement import (
+    DECISION_SCORE,
+    NEAR_STAGES,
+    SEARCH_STAGES,
+    PartView,
+    PoseEvidence,
+    PoseRefiner,
+    Stage,
+    WorkingScaleOptions,
+)
 
 Schedule = tuple[Stage, ...]
 

@@ -20,8 +20,7 @@ from arview.detection.search.template_bank import (
     sector_of,
 )
 from arview.detection.search.template_matching import visible_score
-from arview.refinement.kernels import nearest_view
-from arview.refinement.projection import ViewArrays
+from arview.refinement import ViewArrays, nearest_view
 
 MAX_OUTLINE_REACH = 1.4
 """Half diameters from the part's centre within which its outline lies in the image; near parts reach beyond 1."""

@@ -4,9 +4,16 @@ from __future__ import annotations
 
 from arview.detection.features.image_pyramid import ImagePyramid, WorkPicture
 from arview.geometry import Array, are_near
-from arview.refinement.refiner import PoseRefiner
-from arview.refinement.schedules import LAST_STAGES, SEARCH_STAGES, Stage
-from arview.refinement.working_picture import MARGIN_PX, WorkingScaleOptions, window_around, working_picture
+from arview.refinement import (
+    LAST_STAGES,
+    MARGIN_PX,
+    SEARCH_STAGES,
+    PoseRefiner,
+    Stage,
+    WorkingScaleOptions,
+    window_around,
+)
+from arview.refinement.working_picture import working_picture
 
 MIN_GAIN = 1.3
 """How much larger than the working picture the finest one must be to be worth its time."""

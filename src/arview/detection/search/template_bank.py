@@ -14,17 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from arview.cad.view_range import ViewRange
+from arview.cad import ViewRange
 from arview.core.kernel import kernel
 from arview.detection.features.response_maps import orientation_bins
 from arview.errors import InputError
 from arview.geometry import Array, rolls_between
-from arview.guideviews import GuideViewSet
-from arview.guideviews.extract import ViewFeatures
-from arview.guideviews.mesh_edges import EDGE_CONTOUR
-from arview.guideviews.sphere import icosphere_directions
-from arview.guideviews.uniqueness import view_lines
-from arview.refinement.projection import project_lines
+from arview.guideviews import EDGE_CONTOUR, GuideViewSet, ViewFeatures, icosphere_directions, view_lines
+from arview.refinement import project_lines
 
 FIRST_POINTS = 32
 """Points of a template that are summed everywhere; the others are summed only where the first ones score well."""

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from arview.cad.model import Component, Model
+from arview.cad import Component, Model
 from arview.geometry import Array
 from arview.inspection.fingerprint import fingerprint
 from arview.inspection.record import ComponentDeviation, Finding, Inspection, Verdict

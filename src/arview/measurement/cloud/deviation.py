@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from arview.cad.model import Component, Model
-from arview.cad.part import Part
+from arview.cad import Component, Model, Part
 from arview.errors import InputError
 from arview.geometry import Array, apply, invert, rigid
 from arview.measurement.cloud.mesh_surface import MeshSurface
@@ -33,7 +32,7 @@ from arview.measurement.cloud.registration import (
 )
 from arview.measurement.cloud.visibility import SurfaceVisibility
 from arview.measurement.types import Move, NotMeasured
-from arview.reconstruction.types import DenseCloud, PosedPhoto
+from arview.reconstruction import DenseCloud, PosedPhoto
 
 BAND_MM = 5.0
 """Distance from its nominal surface within which a component's points are searched for; larger displacements are not

@@ -10,14 +10,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.cad.model import Model
+from arview.cad import Model
 from arview.core.atomic import write_file
 from arview.errors import InputError
 from arview.geometry import Array, apply, look_at
 from arview.inspection import DistanceStatistics
 from arview.measurement.cloud.mesh_surface import MeshSurface
 from arview.measurement.plot import Chart, Picture
-from arview.reconstruction.types import DenseCloud
+from arview.reconstruction import DenseCloud
 
 _BINS = 400
 """Bins of the histogram from which the width at half maximum is taken."""

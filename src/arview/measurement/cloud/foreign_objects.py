@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from arview.cad.model import Model
+from arview.cad import Model
 from arview.geometry import Array, apply
 from arview.measurement.cloud.mesh_surface import MeshSurface
 from arview.measurement.cloud.points import prepare_cloud
-from arview.reconstruction.types import DenseCloud
+from arview.reconstruction import DenseCloud
 
 FAR_MM = 4.0
 """Points nearer to the CAD, with components at their measured places, belong to it or to a weld."""

@@ -11,15 +11,14 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from arview.cad.model import Model
+from arview.cad import Model
 from arview.core.parallel import pool
 from arview.errors import InputError
 from arview.geometry import Array, apply, exp_so3, invert, rigid
 from arview.measurement.cloud.mesh_surface import MeshSurface
 from arview.measurement.cloud.pair_registration import find_by_pairs
 from arview.measurement.cloud.registration import TUKEY_SIGMAS
-from arview.reconstruction.scale.similarity import Similarity
-from arview.reconstruction.types import DenseCloud
+from arview.reconstruction import DenseCloud, Similarity
 
 POINTS = 4000
 """Points of cloud and CAD each; a few for each voxel."""

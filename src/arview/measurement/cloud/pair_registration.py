@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from arview.cad.model import Model
+from arview.cad import Model
 from arview.core.parallel import pool, thread_count
 from arview.errors import InputError
 from arview.geometry import Array, apply, invert, rigid

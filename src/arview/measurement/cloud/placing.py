@@ -8,15 +8,14 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.cad.model import Model
+from arview.cad import Model
 from arview.errors import InputError
 from arview.geometry import Array, apply
 from arview.measurement.cloud.global_registration import find_model_in_cloud
 from arview.measurement.cloud.mesh_surface import MeshSurface
 from arview.measurement.cloud.points import CloudPoints, grid_average, join
 from arview.measurement.cloud.reading import UNITS_MM, RawPoints
-from arview.reconstruction.scale.similarity import Similarity
-from arview.reconstruction.types import DenseCloud
+from arview.reconstruction import DenseCloud, Similarity
 
 MAX_POINTS = 2_500_000
 """A larger cloud is averaged on a grid."""

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from arview.errors import InputError
 from arview.geometry import Array
-from arview.reconstruction.types import DenseCloud
+from arview.reconstruction import DenseCloud
 
 _CHUNK = 4_000_000
 """Points averaged at a time, so that memory does not grow with the cloud."""

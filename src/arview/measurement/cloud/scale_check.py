@@ -10,12 +10,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from arview.cad.model import Model
+from arview.cad import Model
 from arview.errors import InputError
 from arview.geometry import Array, exp_so3, rigid
 from arview.measurement.cloud.mesh_surface import MeshSurface
 from arview.measurement.cloud.points import prepare_cloud
-from arview.reconstruction.types import DenseCloud
+from arview.reconstruction import DenseCloud
 
 REACH_MM = 4.0
 """Points farther from the base are left out in the first step."""

@@ -8,11 +8,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.cad.model import Model
+from arview.cad import Model
 from arview.camera import Camera
 from arview.geometry import Array, apply
-from arview.reconstruction.types import PosedPhoto
-from arview.rendering.rasterizer import rasterise
+from arview.reconstruction import PosedPhoto
+from arview.rendering import rasterise
 
 _SIDE_PX = 800
 """Longer side of the depth pictures: a pixel is below a millimetre where a photo resolves a tenth of one."""

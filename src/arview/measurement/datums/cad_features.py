@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.cad.model import Component
-from arview.cad.part import Datum
+from arview.cad import Component, Datum
 from arview.errors import InputError
 from arview.geometry import Array
 

@@ -8,8 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.cad.model import Model
-from arview.cad.part import Datum
+from arview.cad import Datum, Model
 from arview.geometry import Array
 from arview.measurement.cloud.mesh_surface import MeshSurface
 from arview.measurement.cloud.points import CloudPoints, prepare_cloud
@@ -24,7 +23,7 @@ from arview.measurement.datums.equations import (
 from arview.measurement.datums.options import CLEAR_MM, MIN_CLEAR_MM, POINT_RADIUS_MM, REACH_MM
 from arview.measurement.photo.patches import near_others
 from arview.measurement.types import Move
-from arview.reconstruction.types import DenseCloud
+from arview.reconstruction import DenseCloud
 
 _GRID_MM = 0.5
 """Cell of the grid on which the cloud is averaged."""

@@ -8,9 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.cad.model import Component
-from arview.cad.part import Datum
-from arview.cad.samples import sample_surface
+from arview.cad import Component, Datum, sample_surface
 from arview.errors import InputError
 from arview.geometry import Array
 from arview.measurement.datums.cad_features import edge_line, round_faces

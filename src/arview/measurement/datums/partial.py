@@ -7,9 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from arview.cad.datum_check import find_rims
-from arview.cad.model import Component, Model
-from arview.cad.part import Datum, DatumFeature
+from arview.cad import Component, Datum, DatumFeature, Model, find_rims
 from arview.errors import InputError
 from arview.inspection import FailedDatum
 from arview.measurement.datums.datum_fit import check_covered

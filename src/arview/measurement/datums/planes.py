@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.cad.model import Component
-from arview.cad.part import Datum
+from arview.cad import Component, Datum
 from arview.geometry import Array
 from arview.measurement.photo.patches import tangents_of
 

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from arview.cad.model import Model
-from arview.cad.part import Datum
+from arview.cad import Datum, Model
 from arview.errors import InputError
 from arview.geometry import Array
 from arview.measurement.photo.patches import tangents_of

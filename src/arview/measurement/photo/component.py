@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from arview.cad.part import Part
+from arview.cad import Part
 from arview.geometry import Array, apply, exp_so3, log_so3, rigid
 from arview.measurement.photo.fit import RigidFit
 from arview.measurement.photo.patches import free_directions, turning_center

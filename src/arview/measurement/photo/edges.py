@@ -12,12 +12,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.cad.model import make_model
+from arview.cad import make_model
 from arview.camera import Camera
 from arview.core.kernel import kernel
 from arview.core.subpixel_edges import choose_steps, find_steps, linear_light
 from arview.geometry import Array, apply, invert, rigid
-from arview.guideviews.mesh_edges import EDGE_CREASE, EDGE_SILHOUETTE, mesh_edges, sample_visible_edges
+from arview.guideviews import EDGE_CREASE, EDGE_SILHOUETTE, sample_visible_edges
+from arview.guideviews.mesh_edges import mesh_edges
 from arview.measurement.photo.component import MeasuredComponent
 from arview.measurement.photo.fit import RigidFit, fit_rigid, move_rows
 from arview.measurement.photo.options import JOINT_MM, UNDETERMINED_MM

@@ -6,9 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from arview.cad.model import Model
-from arview.cad.part import Part
-from arview.cad.samples import Samples, sample_surface
+from arview.cad import Model, Part, Samples, sample_surface
 from arview.core.parallel import pool
 from arview.measurement.photo.component import MeasuredComponent
 from arview.measurement.photo.edges import ComponentEdges
@@ -16,7 +14,7 @@ from arview.measurement.photo.patches import near_others
 from arview.measurement.photo.sweep import MIN_VIEWS, SAMPLE_SPACING_PX, SAMPLES, ComponentSweep, sweep_offsets
 from arview.measurement.photo.views import PhotoViews, load_views
 from arview.measurement.types import Method, Move, NotMeasured
-from arview.reconstruction.types import SparseModel
+from arview.reconstruction import SparseModel
 
 ABSENT_SUPPORT = 0.1
 """Share of a component's edges found below which nothing of it is there."""

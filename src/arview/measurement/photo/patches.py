@@ -8,14 +8,11 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.cad.model import Component, Model, make_model
-from arview.cad.part import Part
-from arview.cad.samples import Samples
-from arview.cad.symmetry import Symmetry, find_symmetries
+from arview.cad import Component, Model, Part, Samples, Symmetry, find_symmetries, make_model
 from arview.core.kernel import kernel
 from arview.geometry import Array
 from arview.guideviews.mesh_edges import mesh_edges
-from arview.rendering.raycast import RayCaster
+from arview.rendering import RayCaster
 
 
 def tangents_of(normals: Array) -> tuple[Array, Array]:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.cad.samples import Samples, sample_surface
+from arview.cad import Samples, sample_surface
 from arview.geometry import Array, apply
 from arview.measurement.photo.component import MeasuredComponent
 from arview.measurement.photo.fit import RigidFit, fit_rigid, move_rows
@@ -29,7 +29,7 @@ from arview.measurement.photo.patches import (
 )
 from arview.measurement.photo.views import PhotoViews
 from arview.measurement.types import Move, NotMeasured
-from arview.rendering.raycast import RayCaster
+from arview.rendering import RayCaster
 
 SAMPLES = 1000
 """Samples on a component's surface; more of them overlap and add cost without information."""

@@ -9,14 +9,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.cad.model import Model
+from arview.cad import Model
 from arview.camera import Camera
 from arview.core.kernel import kernel
 from arview.core.parallel import pool
 from arview.errors import InputError
 from arview.geometry import Array, apply
-from arview.reconstruction.types import SparseModel
-from arview.rendering.rasterizer import rasterise
+from arview.reconstruction import SparseModel
+from arview.rendering import rasterise
 
 
 class PhotoStack(NamedTuple):
@@ -155,7 +155,7 @@ def load_views(sparse: SparseModel, model: Model) -> PhotoViews:
     Raises:
         InputError: there are fewer than three photos, a photo cannot be read, or its size differs from its camera's.
     """
-    from arview.reconstruction.intake import read_photo
+    from arview.reconstruction import read_photo
 
     if len(sparse.photos) < 3:
         raise InputError(f"photos: {len(sparse.photos)} were placed; measuring in photos needs at least 3")

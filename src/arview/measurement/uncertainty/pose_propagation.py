@@ -7,14 +7,14 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.cad.model import Component, Model
+from arview.cad import Component, Model
 from arview.core.parallel import pool
 from arview.errors import InputError
 from arview.geometry import Array, apply
 from arview.measurement.datums.alignment import Alignment
 from arview.measurement.datums.equations import point_from_move
-from arview.reconstruction.types import PosedPhoto, SparseModel
-from arview.rendering.renderers import ZBufferRenderer
+from arview.reconstruction import PosedPhoto, SparseModel
+from arview.rendering import ZBufferRenderer
 
 DRAWN_PX = 500
 """Longer side at which the model is rendered to find out which photo shows which point."""

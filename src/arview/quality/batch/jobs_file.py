@@ -8,10 +8,9 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
+from arview import reconstruction, workflow
 from arview.errors import InputError
 from arview.quality.batch.storage import is_url, join_location
-from arview.reconstruction.part_masks import AUTO
-from arview.workflow.job import InspectJob
 
 JOBS_FILE_EXAMPLE = """\
 # Inspections of many parts. Paths are relative to this file, or URLs of fsspec (s3://bucket/…, gs://…, sftp://…).
@@ -52,7 +51,7 @@ class BatchJob:
     """One inspection of a batch: its name, its inputs, and the folder or URL of its results."""
 
     name: str
-    job: InspectJob
+    job: workflow.InspectJob
     out: str
 
 
@@ -76,7 +75,7 @@ def load_jobs(path: str | Path) -> tuple[BatchJob, ...]:
     defaults, entries = content.get("defaults", {}), content.get("job", [])
     if not isinstance(defaults, dict) or not isinstance(entries, list) or not entries:
         raise InputError(f"{path}: expected one [defaults] and at least one [[job]]")
-    known = ("name", *(field.name for field in fields(InspectJob)))
+    known = ("name", *(field.name for field in fields(workflow.InspectJob)))
     _refuse_unknown(defaults, known[1:], f"{path}: [defaults]")
     jobs: dict[str, BatchJob] = {}
     for number, entry in enumerate(entries, 1):
@@ -94,7 +93,7 @@ def load_jobs(path: str | Path) -> tuple[BatchJob, ...]:
     return tuple(jobs.values())
 
 
-def _job(values: dict[str, Any], base: Path, place: str) -> InspectJob:
+def _job(values: dict[str, Any], base: Path, place: str) -> workflow.InspectJob:
     if "part" not in values:
         raise InputError(f"{place}: part: is missing; give a part file or CAD file")
     if not values.get("photos") and not values.get("video"):
@@ -106,10 +105,12 @@ def _job(values: dict[str, Any], base: Path, place: str) -> InspectJob:
             raise InputError(
                 f"{place}: {key}: {value!r}, expected {'a number' if kind in (int, float) else kind.__name__}"
             )
-        is_word = (key.endswith("camera") and value.startswith("fov:")) or (key == "masks" and value == AUTO)
+        is_word = (key.endswith("camera") and value.startswith("fov:")) or (
+            key == "masks" and value == reconstruction.AUTO
+        )
         if key in LOCATION_FIELDS and not is_word:
             values[key] = _placed(value, base)
-    return InspectJob(**values)
+    return workflow.InspectJob(**values)
 
 
 def _placed(text: str, base: Path) -> str:

@@ -17,19 +17,18 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from arview import workflow
 from arview.core.extras import require
 from arview.core.stage_cache import write_json
 from arview.errors import ArviewError, CannotMeasureError, InputError, MismatchError, MissingDependencyError
-from arview.inspection.fingerprint import content_hash, fingerprint_of_file
+from arview.inspection import content_hash, fingerprint_of_file
 from arview.quality.batch.jobs_file import LOCATION_FIELDS, BatchJob
 from arview.quality.batch.storage import download, is_url, read, upload
 from arview.version import __version__
-from arview.workflow.lock import exclusive_access
 
 if TYPE_CHECKING:
     from distributed import Client
 
-    from arview.workflow.job import InspectJob
 
 RESULT = "result.json"
 """Name of the file that marks the results of a job as complete."""
@@ -80,22 +79,21 @@ class Work:
         files: names of the possible results.
     """
 
-    key: Callable[[InspectJob, Path], str]
-    inspect: Callable[[InspectJob, Path], tuple[str, str]]
+    key: Callable[[workflow.InspectJob, Path], str]
+    inspect: Callable[[workflow.InspectJob, Path], tuple[str, str]]
     files: tuple[str, ...]
 
 
-def _inspect_key(job: InspectJob, folder: Path) -> str:
-    from arview.workflow.prepare import job_key, prepare
+def _inspect_key(job: workflow.InspectJob, folder: Path) -> str:
+    from arview.workflow.prepare import prepare
 
-    return job_key(prepare(job, folder))
+    return workflow.job_key(prepare(job, folder))
 
 
-def _inspect(job: InspectJob, folder: Path) -> tuple[str, str]:
-    from arview.workflow.run import inspect_part
+def _inspect(job: workflow.InspectJob, folder: Path) -> tuple[str, str]:
 
     try:
-        outcome = inspect_part(job, folder)
+        outcome = workflow.inspect_part(job, folder)
     except CannotMeasureError as error:
         return "not_measured", str(error)
     return outcome.verdict.value, outcome.sentence
@@ -133,13 +131,13 @@ def run_job(job: BatchJob, work: Work = INSPECTION, scratch: str | None = None) 
             local = _local(job.job, Path(temporary) / "in")
             if is_url(job.out):
                 return _run(job, local, Path(temporary) / "out", work)
-            with exclusive_access(Path(job.out), ".job.lock", waits=True):
+            with workflow.exclusive_access(Path(job.out), ".job.lock", waits=True):
                 return _run(job, local, Path(job.out), work)
         except (InputError, MismatchError, MissingDependencyError) as error:
             return JobResult(job.name, "error", str(error), job.out)
 
 
-def _local(job: InspectJob, folder: Path) -> InspectJob:
+def _local(job: workflow.InspectJob, folder: Path) -> workflow.InspectJob:
     """The job with all inputs that are URLs downloaded to a folder."""
     for name in LOCATION_FIELDS:
         location = getattr(job, name)
@@ -149,7 +147,7 @@ def _local(job: InspectJob, folder: Path) -> InspectJob:
     return job
 
 
-def _run(job: BatchJob, local: InspectJob, folder: Path, work: Work) -> JobResult:
+def _run(job: BatchJob, local: workflow.InspectJob, folder: Path, work: Work) -> JobResult:
     key = work.key(local, folder)
     earlier = finished(job, key)
     if earlier is not None:

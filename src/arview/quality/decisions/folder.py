@@ -11,8 +11,15 @@ from dataclasses import replace
 from pathlib import Path
 
 from arview.errors import InputError
-from arview.inspection import ComponentDeviation, Inspection, Verdict, load_inspection
-from arview.inspection.fingerprint import component_fingerprint, fingerprint_of_file, values_fingerprint
+from arview.inspection import (
+    ComponentDeviation,
+    Inspection,
+    Verdict,
+    component_fingerprint,
+    fingerprint_of_file,
+    load_inspection,
+    values_fingerprint,
+)
 from arview.quality.decisions.attachments import attachment_faults, is_attachment, photo_fault
 from arview.quality.decisions.entry import Decision, checked_name, checked_text
 from arview.quality.decisions.log import DecisionLog

@@ -7,8 +7,14 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
 
-from arview.inspection import ComponentDeviation, Finding, Inspection, Verdict
-from arview.inspection.fingerprint import component_fingerprint, values_fingerprint
+from arview.inspection import (
+    ComponentDeviation,
+    Finding,
+    Inspection,
+    Verdict,
+    component_fingerprint,
+    values_fingerprint,
+)
 from arview.quality.decisions.entry import Decision, decision_document, stamp
 from arview.quality.decisions.log import LogContent
 

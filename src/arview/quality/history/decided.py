@@ -8,16 +8,12 @@ from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
 from typing import Any
 
-from arview.inspection import Verdict
-from arview.inspection.document import from_document
-from arview.quality.decisions import Decision, RecordState, record_state
-from arview.quality.decisions.entry import FIRST, line_of, stamp
-from arview.quality.decisions.log import LogContent
-from arview.quality.decisions.record import Recheck
+from arview.inspection import Verdict, from_document
+from arview.quality import decisions
 
 
 def new_rows(
-    result_id: int, entries: Sequence[Decision], known: Mapping[int, str]
+    result_id: int, entries: Sequence[decisions.Decision], known: Mapping[int, str]
 ) -> tuple[list[dict[str, Any]], list[str]]:
     """Rows of the entries of a log that a store does not have, and what contradicts the entries that it has.
 
@@ -36,12 +32,12 @@ def new_rows(
     return [_row(result_id, one) for one in entries if one.number not in known], faults[:1]
 
 
-def _row(result_id: int, one: Decision) -> dict[str, Any]:
+def _row(result_id: int, one: decisions.Decision) -> dict[str, Any]:
     return {
         "result_id": result_id,
         "number": one.number,
         "kind": one.kind,
-        "time": stamp(one.time),
+        "time": decisions.stamp(one.time),
         "by": one.by,
         "component": one.component,
         "is_ok": None if one.is_ok is None else int(one.is_ok),
@@ -57,9 +53,9 @@ def _row(result_id: int, one: Decision) -> dict[str, Any]:
     }
 
 
-def decision_of_row(row: Any) -> Decision:
+def decision_of_row(row: Any) -> decisions.Decision:
     """The entry that a row of the store holds."""
-    return Decision(
+    return decisions.Decision(
         number=int(row.number),
         kind=row.kind,
         time=datetime.fromisoformat(row.time),
@@ -78,14 +74,14 @@ def decision_of_row(row: Any) -> Decision:
     )
 
 
-def decided_faults(entries: Sequence[Decision]) -> list[str]:
+def decided_faults(entries: Sequence[decisions.Decision]) -> list[str]:
     """What was changed in the stored entries of one log after they were added."""
-    before, faults = FIRST, []
+    before, faults = decisions.FIRST, []
     for number, one in enumerate(entries, 1):
         if one.number != number or one.previous != before:
             faults.append(f"decision {number} was removed or changed")
             break
-        if hashlib.sha256(line_of(one)).hexdigest() != one.sha256:
+        if hashlib.sha256(decisions.line_of(one)).hexdigest() != one.sha256:
             faults.append(f"decision {number} was changed")
             break
         before = one.sha256
@@ -93,8 +89,8 @@ def decided_faults(entries: Sequence[Decision]) -> list[str]:
 
 
 def stored_state(
-    document: str, content_hash: str, entries: Sequence[Decision], find: Callable[[str], str | None]
-) -> RecordState:
+    document: str, content_hash: str, entries: Sequence[decisions.Decision], find: Callable[[str], str | None]
+) -> decisions.RecordState:
     """What the decisions say of a stored result.
 
     Args:
@@ -103,16 +99,16 @@ def stored_state(
         entries: about it.
         find: the document of another result by its hash, for the checks of reworked components that were signed.
     """
-    content = LogContent(entries=tuple(entries), faults=tuple(decided_faults(entries)))
+    content = decisions.LogContent(entries=tuple(entries), faults=tuple(decided_faults(entries)))
     signed = [one for one in entries if one.kind == "signature"]
     rechecks = [_recheck(sha256, find(sha256)) for sha256 in (signed[-1].rechecks if signed else ())]
-    return record_state(from_document(json.loads(document)), content_hash, content, rechecks)
+    return decisions.record_state(from_document(json.loads(document)), content_hash, content, rechecks)
 
 
-def _recheck(sha256: str, document: str | None) -> Recheck:
+def _recheck(sha256: str, document: str | None) -> decisions.Recheck:
     """A check of reworked components; without any if the store does not have it."""
     if document is None:
-        return Recheck(sha256, datetime.fromtimestamp(0.0, UTC), ())
+        return decisions.Recheck(sha256, datetime.fromtimestamp(0.0, UTC), ())
     inspection = from_document(json.loads(document))
     measured = tuple(one for one in inspection.components if one.verdict is not Verdict.NOT_MEASURED)
-    return Recheck(sha256, inspection.created, measured, inspection.provenance.photos_hash)
+    return decisions.Recheck(sha256, inspection.created, measured, inspection.provenance.photos_hash)

@@ -7,9 +7,8 @@ import io
 from collections.abc import Sequence
 from typing import Any
 
-from arview.inspection.rounding import decimals_beside_limit, decimals_of, exact, fixed
-from arview.quality.decisions import Decision
-from arview.quality.decisions.table import decision_word
+from arview.inspection import decimals_beside_limit, decimals_of, exact, fixed
+from arview.quality import decisions
 from arview.quality.history.store import HistoryStore, StoredResult
 
 HEADER = (
@@ -92,13 +91,13 @@ def _numbers(row: dict[str, Any]) -> list[str]:
     return [cells[key] for key in keys]
 
 
-def _decided(one: Decision | None) -> list[str]:
+def _decided(one: decisions.Decision | None) -> list[str]:
     if one is None:
         return ["", "", "", ""]
-    return [decision_word(one), _text(one.reason), _text(one.by), f"{one.time:%Y-%m-%dT%H:%M:%SZ}"]
+    return [decisions.decision_word(one), _text(one.reason), _text(one.by), f"{one.time:%Y-%m-%dT%H:%M:%SZ}"]
 
 
-def record_sentence(store: HistoryStore, one: StoredResult, entries: Sequence[Decision]) -> str:
+def record_sentence(store: HistoryStore, one: StoredResult, entries: Sequence[decisions.Decision]) -> str:
     """What people decided about a stored result, in words."""
     return store.state(one, entries).sentence
 

@@ -30,10 +30,8 @@ from sqlalchemy.exc import (
 
 from arview.core.extras import install_command
 from arview.errors import InputError, MissingDependencyError, OutputError
-from arview.inspection import Inspection, load_inspection
-from arview.inspection.fingerprint import content_hash
-from arview.inspection.summary import overall_verdict
-from arview.quality.decisions import Decision, RecordState, log_of
+from arview.inspection import Inspection, content_hash, load_inspection, overall_verdict
+from arview.quality import decisions as quality
 from arview.quality.history.connection import BUSY_S, begin_sqlite, file_system, prepare_sqlite, store_url
 from arview.quality.history.decided import decided_faults, decision_of_row, new_rows, stored_state
 from arview.quality.history.tables import STORE_VERSION, about, components, decisions, guards, metadata, results, voids
@@ -182,13 +180,13 @@ class HistoryStore:
             "document": json.dumps(document, ensure_ascii=False, allow_nan=False),
         }
         added = self._retried(lambda: self._insert(row, loaded))
-        content = log_of(path).content()
+        content = quality.log_of(path).content()
         if not content.entries and not content.faults:
             return added
         count, faults = (0, content.faults) if content.faults else self._add_decisions(added.id, content.entries)
         return replace(added, decisions=count, decision_faults=tuple(faults))
 
-    def _add_decisions(self, result_id: int, entries: Sequence[Decision]) -> tuple[int, Sequence[str]]:
+    def _add_decisions(self, result_id: int, entries: Sequence[quality.Decision]) -> tuple[int, Sequence[str]]:
         """Add the entries of a log that the store does not have; their number, and what contradicts those stored."""
 
         def insert() -> tuple[int, Sequence[str]]:
@@ -204,13 +202,13 @@ class HistoryStore:
 
         return self._retried(insert)
 
-    def decisions(self, result_id: int) -> tuple[Decision, ...]:
+    def decisions(self, result_id: int) -> tuple[quality.Decision, ...]:
         """The decisions, ticks and signatures about a result, in their order; none in the store of an older arview."""
         return self.decided([result_id]).get(result_id, ())
 
-    def decided(self, ids: Sequence[int]) -> dict[int, tuple[Decision, ...]]:
+    def decided(self, ids: Sequence[int]) -> dict[int, tuple[quality.Decision, ...]]:
         """The decisions, ticks and signatures about results, by their numbers."""
-        found: dict[int, list[Decision]] = {}
+        found: dict[int, list[quality.Decision]] = {}
         with self._begin() as connection:
             if ids and sa.inspect(connection).has_table(decisions.name):
                 query = sa.select(decisions).where(decisions.c.result_id.between(min(ids), max(ids)))
@@ -318,7 +316,7 @@ class HistoryStore:
             raise InputError(f"{self.name}: more than one result begins with {key}; give more digits")
         return _listed(rows[0], voided), str(rows[0].document)
 
-    def state(self, result: StoredResult, entries: Sequence[Decision]) -> RecordState:
+    def state(self, result: StoredResult, entries: Sequence[quality.Decision]) -> quality.RecordState:
         """What decisions about a result say of it together; see `decided`."""
 
         def find(sha256: str) -> str | None:

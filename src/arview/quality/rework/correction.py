@@ -6,12 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from arview.cad.model import Model
-from arview.cad.part import Part
+from arview import measurement
+from arview.cad import Model, Part
 from arview.geometry import Array, apply, log_so3
 from arview.inspection import MEASURANDS, ComponentDeviation
-from arview.measurement.measurand import measurand_of, seat_of
-from arview.measurement.photo.patches import near_others
 from arview.quality.rework.words import up_of
 
 
@@ -76,7 +74,7 @@ def standing_of(one: ComponentDeviation, part: Part) -> Standing:
         InputError: the model has no such component, or it has no point such as the part file names.
     """
     component = part.model.component(one.name)
-    measurand = measurand_of(one.name, part)
+    measurand = measurement.measurand_of(one.name, part)
     details = one.details
     center, point = measurand.point_in_model, MEASURANDS[measurand.kind]
     axis, axis_from = measurand.axes[2], measurand.axis_from
@@ -84,7 +82,7 @@ def standing_of(one: ComponentDeviation, part: Part) -> Standing:
         center, point = np.array(details.center_mm), MEASURANDS[details.measurand]
         if details.axes is not None and details.axis_from is not None:
             axis, axis_from = np.array(details.axes)[2], details.axis_from
-    seat = seat_of(component, part.model)
+    seat = measurement.seat_of(component, part.model)
     normal = up_of(part) if seat is None or seat.normal is None else seat.normal
     low, high = component.bounds_in_model
     return Standing(
@@ -108,7 +106,7 @@ def _seat_name(name: str, part: Part, middle: Array) -> str:
     for other in model.components:
         if other.name != name:
             pair = Model(model.name, (component, other), model.source_hash)
-            counts[other.name] = int(near_others(points, pair, 0, 0.3).sum())
+            counts[other.name] = int(measurement.near_others(points, pair, 0, 0.3).sum())
     best = max(counts, key=lambda one: counts[one], default="")
     return best if best and counts[best] else ""
 

@@ -8,15 +8,13 @@ from html import escape
 
 import numpy as np
 
-from arview.cad.model import Component
-from arview.cad.part import Part
+from arview.cad import Component, Part
 from arview.errors import InputError
 from arview.geometry import Array, apply
-from arview.inspection import ComponentDeviation, Finding, Inspection
-from arview.inspection.rounding import exact
+from arview.inspection import ComponentDeviation, Finding, Inspection, exact
 from arview.quality.rework import svg
 from arview.quality.rework.correction import Correction, Standing, correction_of, standing_of
-from arview.quality.rework.instructions import instructions
+from arview.quality.rework.instructions import make_instructions
 from arview.quality.rework.outline import ParallelView, Window, visible_lines
 from arview.quality.rework.types import Instruction, ReworkMove
 from arview.quality.rework.words import across, targets_of, up_of
@@ -108,7 +106,7 @@ def drawing_svg(part: Part, inspection: Inspection, component: str) -> str:
     if deviation is None:
         known = ", ".join(one.name for one in inspection.components)
         raise InputError(f"the inspection has no component {component!r}; it has: {known}")
-    told = {one.component: one for one in instructions(part, inspection)}
+    told = {one.component: one for one in make_instructions(part, inspection)}
     subject = _subject(part, deviation, told.get(component))
     low, high = _extent(subject)
     scale = min(

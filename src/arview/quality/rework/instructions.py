@@ -7,10 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from arview.cad.part import Part, ReworkSettings
+from arview.cad import Part, ReworkSettings
 from arview.geometry import Array
-from arview.inspection import ComponentDeviation, Finding, Inspection, Verdict
-from arview.inspection.rounding import decimals_of, fixed
+from arview.inspection import ComponentDeviation, Finding, Inspection, Verdict, decimals_of, fixed
 from arview.quality.rework.correction import Correction, Standing, correction_of, standing_of
 from arview.quality.rework.kinds import ANY_FIXING, FIXING, INSTALL_STEPS, LAST_STEP, STEPS
 from arview.quality.rework.types import Instruction, ReworkMove, ReworkTurn
@@ -41,7 +40,7 @@ MIN_TURN_DEG = 0.02
 """Smaller turns are not asked for."""
 
 
-def instructions(part: Part, inspection: Inspection) -> tuple[Instruction, ...]:
+def make_instructions(part: Part, inspection: Inspection) -> tuple[Instruction, ...]:
     """The rework of each component that is out of tolerance or missing, in the order of the inspection.
 
     Foreign objects and components whose verdict is undecided are no rework.

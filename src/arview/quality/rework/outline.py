@@ -13,10 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.cad.model import Component, make_model
+from arview.cad import Component, make_model
 from arview.geometry import Array
 from arview.guideviews.mesh_edges import mesh_edges
-from arview.rendering.rasterizer import rasterise
+from arview.rendering import rasterise
 
 Window = tuple[float, float, float, float]
 """Left, lower, right and upper edge in the drawing plane, mm."""

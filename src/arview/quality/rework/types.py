@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from arview.inspection.details import Vector3
+from arview.inspection import Vector3
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from arview.cad.part import Part
+from arview.cad import Part
 from arview.geometry import Array
 
 _SIDES = (("front", -90.0), ("back", 90.0), ("left", 180.0), ("right", 0.0))

@@ -13,14 +13,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.cad.model import Model
+from arview.cad import Model
 from arview.camera import Camera
 from arview.errors import InputError
 from arview.geometry import Array, apply, invert
 from arview.reconstruction.dense.options import SOURCES, DenseOptions
 from arview.reconstruction.intake.masks import mask_of
 from arview.reconstruction.types import PosedPhoto, SparseModel
-from arview.rendering.rasterizer import rasterise
+from arview.rendering import rasterise
 
 GOOD_ANGLE_DEG = (8.0, 25.0)
 """Angles between two views of a point that count fully. Smaller angles do not determine depth, and at larger ones the

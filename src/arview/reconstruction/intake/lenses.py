@@ -7,11 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from arview.camera import Camera
-from arview.camera.exif import PhotoExif, focal_length_px
-from arview.camera.profiles import profile_of_photo
-from arview.camera.read import guess_camera, load_camera
-from arview.camera.undistort import brown_camera
+from arview.camera import Camera, PhotoExif, brown_camera, focal_length_px, guess_camera, load_camera, profile_of_photo
 from arview.errors import MismatchError
 
 _FOCAL_ROUNDING_MM = 0.055  # focal lengths are written in tenths of a millimetre, or finer

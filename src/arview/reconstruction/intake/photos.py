@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from arview.camera.exif import PhotoExif
+from arview.camera import PhotoExif
 from arview.core.progress import StepProgress
 from arview.errors import ArviewError, InputError, MismatchError
 from arview.reconstruction.intake.checks import PhotoCheck, check_photo, same_views, thumbnail

@@ -12,16 +12,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.camera.exif import (
-    HEIF_SUFFIXES,
-    PHOTO_SUFFIXES,
-    PhotoExif,
-    exif_of,
-    open_picture,
-)
+from arview.camera import HEIF_SUFFIXES, PHOTO_SUFFIXES, PhotoExif, exif_of, open_picture
 from arview.errors import InputError
 from arview.reconstruction.intake.kept import kept
-from arview.video.pictures import sorted_naturally
+from arview.video import sorted_naturally
 
 if TYPE_CHECKING:
     from PIL.Image import Image

@@ -10,7 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from arview.camera.exif import exif_of, open_picture
+from arview.camera import exif_of, open_picture
 from arview.core.atomic import write_file
 from arview.reconstruction.intake.lenses import Lens
 from arview.reconstruction.intake.photos import Intake

@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from arview.camera.undistort import FrameView, UndistortOptions
+from arview.camera import FrameView, UndistortOptions
 from arview.core.atomic import write_file
 from arview.core.progress import StepProgress
 from arview.reconstruction.intake.masks import read_mask

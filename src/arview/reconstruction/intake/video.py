@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.camera.exif import PhotoExif
+from arview.camera import PhotoExif
 from arview.core.atomic import write_file
 from arview.core.progress import StepProgress
 from arview.errors import InputError

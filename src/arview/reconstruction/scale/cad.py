@@ -9,17 +9,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.cad.model import Model
-from arview.cad.part import Part
-from arview.cad.view_range import ViewRange
+from arview.cad import Model, Part, ViewRange
 from arview.camera import Camera
 from arview.core.parallel import pool
 from arview.core.progress import Progress
 from arview.core.subpixel_edges import linear_light
 from arview.detection import Detector
 from arview.geometry import Array, invert, rigid
-from arview.guideviews import GuideViewOptions, GuideViewSet
-from arview.guideviews.cache import cached_guide_views
+from arview.guideviews import GuideViewOptions, GuideViewSet, cached_guide_views
 from arview.reconstruction.scale.refine import Fit, JointRefiner, ScaleView, Support
 from arview.reconstruction.scale.similarity import Similarity
 from arview.reconstruction.scale.vote import Sighting, Vote, vote
@@ -215,8 +212,8 @@ def _search(
     progress: Progress | None,
 ) -> tuple[list[Vote], Array, NotFound]:
     """Votes of the detections, rotations (N,3,3) under which the part looks similar, and the reason without a vote."""
-    from arview.detection.detector import options_for
-    from arview.tracking.diagnosis import diagnose_search
+    from arview.detection import options_for
+    from arview.tracking import diagnose_search
 
     detectors: dict[tuple[float, ...], Detector] = {}
     sightings: list[Sighting] = []

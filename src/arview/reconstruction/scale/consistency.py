@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from arview.cad.model import Model
+from arview.cad import Model
 from arview.core.parallel import pool
 from arview.geometry import Array, apply
 from arview.reconstruction.scale.cad import CadFind
 from arview.reconstruction.scale.similarity import Similarity
 from arview.reconstruction.scale.types import Consistency
 from arview.reconstruction.types import SparseModel
-from arview.rendering.renderers import ZBufferRenderer
+from arview.rendering import ZBufferRenderer
 
 MAX_SIDE_PX = 600
 """Longer side at which the CAD is rendered for the check of the points."""

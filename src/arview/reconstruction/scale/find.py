@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.cad.part import Part
+from arview.cad import Part
 from arview.core.progress import Progress
 from arview.geometry import Array
 from arview.reconstruction.scale.cad import CadFind, CadOptions, NotFound, Pixels, find_cad

@@ -14,14 +14,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.cad.model import Model
+from arview.cad import Model
 from arview.camera import Camera
 from arview.core.parallel import pool
 from arview.core.subpixel_edges import choose_steps, find_steps
 from arview.geometry import Array, apply
-from arview.guideviews.mesh_edges import EDGE_SHARP, EDGE_SILHOUETTE, mesh_edges, sample_visible_edges
+from arview.guideviews import EDGE_SHARP, EDGE_SILHOUETTE, sample_visible_edges
+from arview.guideviews.mesh_edges import mesh_edges
 from arview.reconstruction.scale.similarity import Similarity
-from arview.rendering.renderers import ZBufferRenderer
+from arview.rendering import ZBufferRenderer
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from arview.errors import InputError
-from arview.fiducials.board import DEFAULT_DICTIONARY, Board, Tags, dictionary_name, parse_board, parse_length_mm
+from arview.fiducials import DEFAULT_DICTIONARY, Board, Tags, dictionary_name, parse_board, parse_length_mm
 from arview.geometry import Array, check_rigid
 
 BAR_FORM = "ID1:ID2:LENGTH_MM or DICTIONARY:ID1:ID2:LENGTH_MM, e.g. 3:7:500.02"

@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arview.core.parallel import pool
-from arview.fiducials.board import Board, Tags, cv_board
-from arview.fiducials.targets import CornerKey, find_corners
+from arview.fiducials import Board, CornerKey, Tags, cv_board, find_corners
 from arview.geometry import Array
 from arview.reconstruction.scale.similarity import fit_points
 from arview.reconstruction.scale.specs import Rig, ScaleBar, ScaleSources

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arview.camera import Camera
-from arview.fiducials.targets import CornerKey
+from arview.fiducials import CornerKey
 from arview.geometry import Array
 
 CornerSightings = tuple[Camera, Array, NDArray[np.intp], Array]

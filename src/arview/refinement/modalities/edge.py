@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from arview.core.kernel import kernel
 from arview.geometry import Array
-from arview.guideviews.mesh_edges import EDGE_CONTOUR, EDGE_SHARP, EDGE_SILHOUETTE
+from arview.guideviews import EDGE_CONTOUR, EDGE_SHARP, EDGE_SILHOUETTE
 from arview.refinement.gauss_newton import add_line
 from arview.refinement.modalities.region import ColorModel
 from arview.refinement.projection import ProjectedLines, project

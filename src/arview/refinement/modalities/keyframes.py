@@ -17,7 +17,7 @@ from arview.core.kernel import kernel
 from arview.geometry import Array, invert
 from arview.refinement.modalities.patch_alignment import Pyramid
 from arview.refinement.projection import project
-from arview.rendering.raycast import Hierarchy, RayCaster, cast_ray
+from arview.rendering import Hierarchy, RayCaster, cast_ray
 
 _RESPONSE = (8.0 / (4 * 255)) ** 2
 """Response of cornerMinEigenVal (3×3 Sobel, uint8) to a mean squared gradient of one (grey level/px)²."""

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from arview.camera import Camera
 from arview.core.kernel import kernel
 from arview.geometry import Array
-from arview.guideviews.surface import Surface, draw_surface
+from arview.guideviews import Surface, draw_surface
 from arview.refinement.gauss_newton import apply_twist, relative_twist
 
 COEFFICIENTS = 9
@@ -203,8 +203,7 @@ def refine_by_shading(
         surface: `Surface` of the part, in the body frame.
         corners: (F,3,3) see `corner_normals`.
         diameter_mm: diameter of the part.
-        cam_from_body: (4,4) the best pose by edges and colours.
-        information: (6,6) of that pose.
+        cam_from_body, information: (4,4) the best pose by edges and colours, and its (6,6) information.
         gain: weight of the shading relative to that information.
         rounds: updates of the pose.
 

@@ -25,7 +25,7 @@ from arview.refinement.modalities.patch_alignment import (
 )
 from arview.refinement.modalities.texture_matching import MatchSettings, align_pose, match_texture
 from arview.refinement.projection import intrinsics_of
-from arview.rendering.raycast import RayCaster
+from arview.rendering import RayCaster
 
 SEARCH_PX = 4
 """Largest common shift, px of the coarsest level; 0 leaves this search out."""

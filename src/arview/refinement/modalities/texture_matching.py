@@ -13,7 +13,7 @@ from arview.refinement.gauss_newton import add_line, apply_twist, solve_step
 from arview.refinement.modalities.keyframes import Anchors, tangent_jacobian, to_camera
 from arview.refinement.modalities.patch_alignment import align_template, common_shift, prepare_template, sample_patch
 from arview.refinement.projection import project
-from arview.rendering.raycast import Hierarchy, cast_ray
+from arview.rendering import Hierarchy, cast_ray
 
 
 class MatchSettings(NamedTuple):

@@ -8,12 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.cad.part import Part
-from arview.cad.view_range import ViewRange
+from arview import reconstruction
+from arview.cad import Part, ViewRange
 from arview.camera import Camera
 from arview.core.checks import check_type
 from arview.geometry import Array, look_at
-from arview.reconstruction.coverage import components_seen
 from arview.station.capture.information import Views, focal_px
 from arview.station.capture.options import CaptureOptions
 
@@ -74,7 +73,9 @@ class CaptureDome:
         middle_mm = float(np.sqrt(distance_mm[0] * distance_mm[1]))
         eyes = model.center_in_model + middle_mm * directions
         up = view_range.up_in_model
-        seen = np.array([components_seen(model, camera, look_at(eye, model.center_in_model, up)) for eye in eyes])
+        seen = np.array(
+            [reconstruction.components_seen(model, camera, look_at(eye, model.center_in_model, up)) for eye in eyes]
+        )
         focal = focal_px(camera) * options.photo_px_per_px
         views = Views.of(component_points(part), seen, eyes, focal)
         return cls(angles, directions, cell_deg, distance_mm, views)

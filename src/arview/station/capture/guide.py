@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.cad.part import Part
+from arview import reconstruction
+from arview.cad import Part
 from arview.camera import Camera
 from arview.core.checks import check_type
 from arview.core.messages import Message
 from arview.geometry import Array, apply, check_rigid
 from arview.pose import Pose, TrackingState
-from arview.reconstruction.coverage import unit
 from arview.station.capture import words
 from arview.station.capture.advice import CaptureAdvice, CellState, RingDistance
 from arview.station.capture.dome import CaptureDome, component_points
@@ -217,7 +217,7 @@ class CaptureGuide:
 
     def _direction(self, cam_from_model: Array) -> Array:
         """(3,) unit vector from the part's centre to the camera."""
-        return unit(-cam_from_model[:3, :3].T @ cam_from_model[:3, 3] - self._center)
+        return reconstruction.unit(-cam_from_model[:3, :3].T @ cam_from_model[:3, 3] - self._center)
 
     def _cell(self, cam_from_model: Array) -> int:
         """The cell of the dome nearest to the camera."""

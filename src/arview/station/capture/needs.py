@@ -7,17 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.cad.part import Part
+from arview import reconstruction
+from arview.cad import Part
 from arview.camera import Camera
 from arview.geometry import Array, apply
-from arview.reconstruction.coverage import (
-    DIRECTION_DEG,
-    DIRECTIONS_WANTED,
-    PHOTOS_WANTED,
-    components_seen,
-    count_separated,
-    unit,
-)
 from arview.station.capture import words
 from arview.station.capture.advice import ComponentNeed
 from arview.station.capture.dome import CaptureDome, component_points
@@ -92,9 +85,9 @@ class CaptureNeeds:
 
     def add(self, cam_from_model: Array) -> None:
         """Count a photo at a pose (4,4)."""
-        seen = np.array(components_seen(self._model, self._camera, cam_from_model))
+        seen = np.array(reconstruction.components_seen(self._model, self._camera, cam_from_model))
         eye = -cam_from_model[:3, :3].T @ cam_from_model[:3, 3]
-        direction = unit(eye - self._center)
+        direction = reconstruction.unit(eye - self._center)
         self._known.add(self._view(seen, eye))
         self._directions.append(direction)
         cell = self._dome.nearest(direction)
@@ -148,7 +141,7 @@ class CaptureNeeds:
             lacking = words.NEVER_SEEN()
         elif self._is_asked[index] and not is_enough[index]:
             is_hidden = cell is not None and not self._dome.is_seen[cell, index]
-            lacking = words.lacking_message(PHOTOS_WANTED - photos, is_hidden)
+            lacking = words.lacking_message(reconstruction.PHOTOS_WANTED - photos, is_hidden)
         predicted = float(u_mm[index]) if photos >= 2 else None
         return ComponentNeed(
             self._model.components[index].name, photos, directions, predicted, bool(is_enough[index]), lacking
@@ -157,7 +150,7 @@ class CaptureNeeds:
     def _counts(self, index: int, views: Views) -> tuple[int, int]:
         """Photos that show a component, and the directions of these that differ."""
         rays = views.rays[views.is_seen[:, index], index]
-        return len(rays), count_separated(rays, DIRECTION_DEG)
+        return len(rays), reconstruction.count_separated(rays, reconstruction.DIRECTION_DEG)
 
     def _assess(self, known: KnownViews | None = None) -> tuple[Array, NDArray[np.bool_], NDArray[np.bool_]]:
         """For some photos, by default those taken: (C,) U, which components have enough, and which can be seen."""
@@ -172,9 +165,11 @@ class CaptureNeeds:
             if not can_be_seen[index]:
                 continue
             goal_mm = max(REACH_SHARE * float(self._reach_mm[index]), U_SHARE * (tolerance or 0.0))
-            wanted = min(PHOTOS_WANTED, photos + int(cells[index]))
+            wanted = min(reconstruction.PHOTOS_WANTED, photos + int(cells[index]))
             is_enough[index] = (
-                photos >= wanted and directions >= min(DIRECTIONS_WANTED, wanted) and u_mm[index] <= goal_mm
+                photos >= wanted
+                and directions >= min(reconstruction.DIRECTIONS_WANTED, wanted)
+                and u_mm[index] <= goal_mm
             )
         return u_mm, is_enough, can_be_seen
 

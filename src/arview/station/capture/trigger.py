@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from arview import reconstruction
 from arview.camera import Camera
 from arview.geometry import Array, apply
-from arview.reconstruction.intake.checks import blur_and_texture
 from arview.station.capture.options import TriggerOptions
 
 GYRO_RAD_S = (0.12, 0.2)
@@ -129,7 +129,7 @@ class FocusMonitor:
 
         It takes some milliseconds, so it is asked only before a photo.
         """
-        blur_px, _ = blur_and_texture(gray)
+        blur_px, _ = reconstruction.blur_and_texture(gray)
         if not np.isfinite(blur_px):  # too few edges to tell
             return True
         self._smallest_blur_px = min(self._smallest_blur_px, blur_px)

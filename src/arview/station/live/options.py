@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from arview.camera.undistort import UndistortOptions
+from arview.camera import UndistortOptions
 from arview.errors import InputError
 
 PHONE = "phone"
@@ -30,8 +30,8 @@ class RequestLimits:
 
     per_s: float = 80.0  # requests of one address; a page that sends JPEGs needs about 35
     burst: float = 240.0
-    strangers_per_s: float = 20.0  # requests of one address without the token
-    strangers_burst: float = 60.0
+    unauthenticated_per_s: float = 20.0  # requests of one address without the token
+    unauthenticated_burst: float = 60.0
     joins_per_s: float = 1.0  # of one address; each join costs a tracker and a handshake
     joins_burst: float = 12.0
     images_per_s: float = 2.0  # of one page; drawing and packing a PNG takes 50 ms of a core

@@ -36,13 +36,9 @@ from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from arview.cad.part import Part
+from arview.cad import Part
 from arview.errors import ArviewError
-from arview.station.live.options import LiveOptions
-from arview.station.live.security.access import Access, Gate
-from arview.station.live.security.limits import RateLimit, body, json_body
-from arview.station.live.security.refusals import Refusal
-from arview.station.live.server.app import refusal_handlers, static_files, static_response
+from arview.station import live
 from arview.station.studio.assessment import Assessments, advice
 from arview.station.studio.document import StudioDocument
 from arview.station.studio.exports import write_exports
@@ -74,7 +70,7 @@ TRIAL_SUFFIXES = {
 """Endings of the names of pictures and clips that can be tried."""
 
 
-def make_app(document: StudioDocument, access: Access, others: Sequence[Part] = ()) -> ASGIApp:
+def make_app(document: StudioDocument, access: live.Access, others: Sequence[Part] = ()) -> ASGIApp:
     """The application, for those with the token of this run."""
     handlers = StudioHandlers(document, others)
     routes = [
@@ -97,9 +93,11 @@ def make_app(document: StudioDocument, access: Access, others: Sequence[Part] = 
         Route("/api/trial.jpg", handlers.trial_picture),
         Route("/api/export", handlers.export, methods=["POST"]),
     ]
-    app = Starlette(routes=routes, exception_handlers={ArviewError: _told, HTTPException: _told, **refusal_handlers()})
-    limits = LiveOptions(source="none").requests
-    return _Ended(Gate(app, access, RateLimit(limits.per_s, limits.burst)))
+    app = Starlette(
+        routes=routes, exception_handlers={ArviewError: _told, HTTPException: _told, **live.refusal_handlers()}
+    )
+    limits = live.LiveOptions(source="none").requests
+    return _Ended(live.Gate(app, access, live.RateLimit(limits.per_s, limits.burst)))
 
 
 class _Ended:
@@ -113,7 +111,7 @@ class _Ended:
         try:
             await self._app(scope, receive, send)
         except asyncio.CancelledError:
-            await Refusal(503, "ended", "the studio has been ended").response()(scope, receive, send)
+            await live.Refusal(503, "ended", "the studio has been ended").response()(scope, receive, send)
 
 
 class StudioHandlers:
@@ -122,7 +120,7 @@ class StudioHandlers:
     def __init__(self, document: StudioDocument, others: Sequence[Part]) -> None:
         self._document = document
         self._views, self._trials = Assessments(others), Trials()
-        self._files = static_files("arview.station.studio")
+        self._files = live.static_files("arview.station.studio")
 
     async def index(self, request: Request) -> Response:
         """The page."""
@@ -146,7 +144,7 @@ class StudioHandlers:
 
     async def edit(self, request: Request) -> Response:
         """Carry out an edit."""
-        change = await json_body(request, EDIT_BYTES, BODY_TIMEOUT_S)
+        change = await live.json_body(request, EDIT_BYTES, BODY_TIMEOUT_S)
         return await self._changed(lambda: self._document.edit(change))
 
     async def undo(self, request: Request) -> Response:
@@ -169,12 +167,12 @@ class StudioHandlers:
 
     async def pick(self, request: Request) -> Response:
         """Features at a point."""
-        asked = await json_body(request, EDIT_BYTES, BODY_TIMEOUT_S)
+        asked = await live.json_body(request, EDIT_BYTES, BODY_TIMEOUT_S)
         component, face, point = asked.get("component"), asked.get("face"), asked.get("point_mm")
         if not (isinstance(component, str) and isinstance(face, int) and isinstance(point, list)):
-            raise Refusal(400, "bad_request", "expected component, face and point_mm")
+            raise live.Refusal(400, "bad_request", "expected component, face and point_mm")
         if len(point) != 3 or not all(isinstance(value, int | float) for value in point):
-            raise Refusal(400, "bad_request", "point_mm: expected three numbers")
+            raise live.Refusal(400, "bad_request", "point_mm: expected three numbers")
         found = await asyncio.to_thread(self._document.pick, component, face, point)
         return JSONResponse({"features": found})
 
@@ -182,7 +180,7 @@ class StudioHandlers:
         """The assessed guide views."""
         done, error = self._views.of(self._document.part)
         if error:
-            raise Refusal(422, "no_views", error)
+            raise live.Refusal(422, "no_views", error)
         if done is None:
             return JSONResponse({"is_pending": True}, 202)
         return JSONResponse(done.describe())
@@ -191,7 +189,7 @@ class StudioHandlers:
         """The picture of a view."""
         png = await asyncio.to_thread(self._views.picture, self._document.part, request.path_params["index"])
         if png is None:
-            raise Refusal(404, "no_such_view", "there is no such view, or the views are still being made")
+            raise live.Refusal(404, "no_such_view", "there is no such view, or the views are still being made")
         return Response(png, media_type="image/png")
 
     async def advice(self, request: Request) -> Response:
@@ -202,31 +200,31 @@ class StudioHandlers:
         """A plan of photos."""
         text = request.query_params.get("count", "24")
         if not (text.isascii() and text.isdecimal() and len(text) < 4):
-            raise Refusal(400, "bad_request", "count: expected a whole number")
+            raise live.Refusal(400, "bad_request", "count: expected a whole number")
         return JSONResponse(await asyncio.to_thread(photo_plan, self._document.part, int(text)))
 
     async def trial(self, request: Request) -> Response:
         """Try a picture or clip."""
         suffix = Path(request.query_params.get("name", "")).suffix.lower()
         if suffix not in TRIAL_SUFFIXES:
-            raise Refusal(415, "bad_type", f"expected a picture or clip ({' '.join(sorted(TRIAL_SUFFIXES))})")
-        content = await body(request, TRIAL_BYTES, BODY_TIMEOUT_S)
+            raise live.Refusal(415, "bad_type", f"expected a picture or clip ({' '.join(sorted(TRIAL_SUFFIXES))})")
+        content = await live.body(request, TRIAL_BYTES, BODY_TIMEOUT_S)
         camera = request.query_params.get("camera") or None
         if camera is not None and not camera.startswith("fov:"):
-            raise Refusal(400, "bad_request", "camera: expected fov:DEG")
+            raise live.Refusal(400, "bad_request", "camera: expected fov:DEG")
         return JSONResponse(await asyncio.to_thread(self._tried, content, suffix, camera))
 
     async def trial_picture(self, request: Request) -> Response:
         """The best frame of the last trial."""
         if self._trials.picture is None:
-            raise Refusal(404, "no_trial", "nothing has been tried yet")
+            raise live.Refusal(404, "no_trial", "nothing has been tried yet")
         return Response(self._trials.picture, media_type="image/jpeg")
 
     async def export(self, request: Request) -> Response:
         """Write files beside the part file."""
-        kinds = (await json_body(request, EDIT_BYTES, BODY_TIMEOUT_S)).get("kinds")
+        kinds = (await live.json_body(request, EDIT_BYTES, BODY_TIMEOUT_S)).get("kinds")
         if not isinstance(kinds, list) or not all(isinstance(kind, str) for kind in kinds):
-            raise Refusal(400, "bad_request", "kinds: expected a list")
+            raise live.Refusal(400, "bad_request", "kinds: expected a list")
         written = await asyncio.to_thread(write_exports, self._document, kinds)
         return JSONResponse({"files": [str(path) for path in written]})
 
@@ -241,11 +239,11 @@ class StudioHandlers:
         return JSONResponse(self._document.describe())
 
     def _file(self, name: str) -> Response:
-        return static_response(self._files, name)
+        return live.static_response(self._files, name)
 
 
 async def _told(request: Request, error: Exception) -> Response:
     """The response to an error that the user can mend."""
     if isinstance(error, HTTPException):
-        return Refusal(error.status_code, "bad_request", str(error.detail)).response()
-    return Refusal(422, "refused", str(error)).response()
+        return live.Refusal(error.status_code, "bad_request", str(error.detail)).response()
+    return live.Refusal(422, "refused", str(error)).response()

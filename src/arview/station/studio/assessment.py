@@ -10,15 +10,9 @@ from typing import Any
 import cv2
 import numpy as np
 
-from arview.cad.model import Model, make_model
-from arview.cad.part import Part
-from arview.cad.view_range import ViewRange
-from arview.guideviews.findings import assessed_guide_views, azimuths_deg, confusable_pair, elevations_deg
-from arview.guideviews.look_alikes import PartLikeness, compare_parts
-from arview.guideviews.sheet import view_tile
-from arview.guideviews.uniqueness import CONFUSABLE_LIKENESS, PLAIN_LINES, Uniqueness, assess
-from arview.guideviews.views import GuideViewSet
-from arview.rendering.renderers import ZBufferRenderer
+from arview import guideviews
+from arview.cad import Model, Part, ViewRange, make_model
+from arview.rendering import ZBufferRenderer
 
 TILE_PX = 320
 """Side of the picture of a view."""
@@ -36,9 +30,9 @@ class Assessment:
         look_alikes: the part beside each of the parts that it might be taken for.
     """
 
-    views: GuideViewSet
-    unique: Uniqueness
-    look_alikes: tuple[PartLikeness, ...] = ()
+    views: guideviews.GuideViewSet
+    unique: guideviews.Uniqueness
+    look_alikes: tuple[guideviews.PartLikeness, ...] = ()
 
     def describe(self) -> dict[str, Any]:
         """The document of the page: verdict, shares, and a row for each view."""
@@ -46,8 +40,8 @@ class Assessment:
         weak = self.weak_words()
         rows = zip(
             views.directions.tolist(),
-            azimuths_deg(views).tolist(),
-            elevations_deg(views).tolist(),
+            guideviews.azimuths_deg(views).tolist(),
+            guideviews.elevations_deg(views).tolist(),
             unique.distinct_lines.tolist(),
             unique.likeness.tolist(),
             unique.confused_with.tolist(),
@@ -58,9 +52,9 @@ class Assessment:
             "is_sufficient": unique.is_sufficient,
             "reason": unique.reason,
             "score": unique.score,
-            "plain_share": float(np.mean(unique.distinct_lines < PLAIN_LINES)),
-            "confusable_share": float(np.mean(unique.likeness >= CONFUSABLE_LIKENESS)),
-            "most_alike": confusable_pair(views, unique),
+            "plain_share": float(np.mean(unique.distinct_lines < guideviews.PLAIN_LINES)),
+            "confusable_share": float(np.mean(unique.likeness >= guideviews.CONFUSABLE_LIKENESS)),
+            "most_alike": guideviews.confusable_pair(views, unique),
             "look_alikes": [vars(one) for one in self.look_alikes],
             "views": [
                 {
@@ -80,7 +74,7 @@ class Assessment:
         """For each view ``plain``, ``alike`` or nothing."""
         unique = self.unique
         return [
-            "plain" if lines < PLAIN_LINES else "alike" if likeness >= CONFUSABLE_LIKENESS else ""
+            "plain" if lines < guideviews.PLAIN_LINES else "alike" if likeness >= guideviews.CONFUSABLE_LIKENESS else ""
             for lines, likeness in zip(unique.distinct_lines, unique.likeness, strict=True)
         ]
 
@@ -119,7 +113,7 @@ class Assessments:
             if self._renderer is None or self._renderer[0] is not done:
                 camera = done.views.camera.scaled(2 * TILE_PX, 2 * TILE_PX)
                 self._renderer = done, ZBufferRenderer(part.model, camera)
-            tile = view_tile(self._renderer[1], done.views, index, done.unique, TILE_PX)
+            tile = guideviews.view_tile(self._renderer[1], done.views, index, done.unique, TILE_PX)
         _, png = cv2.imencode(".png", cv2.cvtColor(tile, cv2.COLOR_RGB2BGR))
         return png.tobytes()
 
@@ -127,7 +121,7 @@ class Assessments:
         done, error = None, ""
         try:
             done = assessed(part.model, key[1])
-            done = replace(done, look_alikes=tuple(compare_parts(part, self._others, done.views)))
+            done = replace(done, look_alikes=tuple(guideviews.compare_parts(part, self._others, done.views)))
         except Exception as failure:  # told on the page
             error = str(failure)
         with self._lock:
@@ -141,8 +135,8 @@ def assessed(model: Model, view_range: ViewRange) -> Assessment:
     Raises:
         InputError: the range puts the camera inside the part.
     """
-    views = assessed_guide_views(model, view_range)
-    return Assessment(views, assess(views))
+    views = guideviews.assessed_guide_views(model, view_range)
+    return Assessment(views, guideviews.assess(views))
 
 
 def advice(part: Part, whole: Model) -> list[dict[str, Any]]:

@@ -10,13 +10,21 @@ from typing import Any
 
 import numpy as np
 
-from arview.cad.check import check_part
-from arview.cad.load import LoadedCad, load_cad
-from arview.cad.model import Model
-from arview.cad.part import Datum, Part
-from arview.cad.part_file import find_part_file, part_from_text
-from arview.cad.picking import PickedFeature, pick_features
-from arview.cad.symmetry import FoundSymmetry, Symmetry, find_symmetries
+from arview.cad import (
+    Datum,
+    FoundSymmetry,
+    LoadedCad,
+    Model,
+    Part,
+    PickedFeature,
+    Symmetry,
+    check_part,
+    find_part_file,
+    find_symmetries,
+    load_cad,
+    part_from_text,
+    pick_features,
+)
 from arview.errors import InputError
 from arview.station.studio.part_text import PartText, Plain
 

@@ -9,13 +9,10 @@ from pathlib import Path
 
 import cv2
 
-from arview.cad.part import Part
+from arview import guideviews
+from arview.cad import Part
 from arview.core.atomic import write_file
 from arview.errors import InputError
-from arview.guideviews.findings import assessed_guide_views
-from arview.guideviews.sheet import contact_sheet
-from arview.guideviews.uniqueness import assess
-from arview.guideviews.views import make_guide_views
 from arview.station.studio.document import StudioDocument
 from arview.station.studio.photo_plan import photo_plan
 
@@ -48,7 +45,7 @@ def write_exports(document: StudioDocument, kinds: Sequence[str]) -> list[Path]:
     for kind in kinds:
         if kind == "gv":
             path = document.path.with_name(f"{stem}.gv")
-            make_guide_views(part.model, part.effective_view_range).save(path)
+            guideviews.make_guide_views(part.model, part.effective_view_range).save(path)
         else:
             ending, make = makers[kind]
             path = document.path.with_name(stem + ending)
@@ -92,8 +89,8 @@ of {low:.0f} to {high:.0f}°.</p>
 
 
 def _sheet(part: Part, max_views: int = 40) -> bytes:
-    views = assessed_guide_views(part.model, part.effective_view_range)
-    sheet = contact_sheet(part.model, views, max_views=max_views, unique=assess(views))
+    views = guideviews.assessed_guide_views(part.model, part.effective_view_range)
+    sheet = guideviews.contact_sheet(part.model, views, max_views=max_views, unique=guideviews.assess(views))
     _, png = cv2.imencode(".png", cv2.cvtColor(sheet, cv2.COLOR_RGB2BGR))
     return png.tobytes()
 

@@ -8,7 +8,7 @@ import json
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.cad.model import Model
+from arview.cad import Model
 from arview.geometry import Array
 from arview.guideviews.mesh_edges import mesh_edges
 

@@ -7,14 +7,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.cad.check import GUESSED_CAMERA
-from arview.cad.part import Part
+from arview import reconstruction
+from arview.cad import GUESSED_CAMERA, Part
 from arview.camera import Camera
 from arview.errors import InputError
 from arview.geometry import Array, look_at
-from arview.reconstruction.coverage import components_seen, spread_deg, unit
-from arview.station.capture.dome import ELEVATION_DEG, asked_elevation_deg, component_points, fitting_distance_mm
-from arview.station.capture.information import KnownViews, Views, expanded_uncertainty, focal_px
+from arview.station import capture
 
 MIN_PHOTOS_OF_COMPONENT = 4
 """Photos that must show a component for a place with a small U."""
@@ -37,15 +35,19 @@ def photo_plan(part: Part, count: int, camera: Camera | None = None) -> dict[str
         raise InputError(f"count: {count} photos, expected 4 to 96")
     camera = camera or GUESSED_CAMERA
     model, view_range = part.model, part.effective_view_range.for_camera(camera, part.model.diameter_mm)
-    fitting_mm = fitting_distance_mm(camera, model.diameter_mm)
+    fitting_mm = capture.fitting_distance_mm(camera, model.diameter_mm)
     distance_mm = max(view_range.distance_mm[0], min(view_range.distance_mm[1], fitting_mm))
     angles = _ring_angles(part, count)
     directions = np.array([view_range.direction(azimuth, elevation) for azimuth, elevation in angles])
     eyes = model.center_in_model + distance_mm * directions
     up = view_range.up_in_model
-    seen = np.array([components_seen(model, camera, look_at(eye, model.center_in_model, up)) for eye in eyes])
-    points = component_points(part)
-    expected_mm = expanded_uncertainty(KnownViews(Views.of(points, seen, eyes, focal_px(camera))).information())
+    seen = np.array(
+        [reconstruction.components_seen(model, camera, look_at(eye, model.center_in_model, up)) for eye in eyes]
+    )
+    points = capture.component_points(part)
+    expected_mm = capture.expanded_uncertainty(
+        capture.KnownViews(capture.Views.of(points, seen, eyes, capture.focal_px(camera))).information()
+    )
     return {
         "distance_mm": distance_mm,
         "photos": [
@@ -63,7 +65,7 @@ def photo_plan(part: Part, count: int, camera: Camera | None = None) -> dict[str
 def _ring_angles(part: Part, count: int) -> list[tuple[float, float]]:
     """Azimuth and elevation of each photo: alternately on a lower and an upper ring."""
     view_range = part.effective_view_range
-    low, high = asked_elevation_deg(view_range, ELEVATION_DEG)
+    low, high = capture.asked_elevation_deg(view_range, capture.ELEVATION_DEG)
     rings = (low + 0.3 * (high - low), low + 0.75 * (high - low))
     start, end = view_range.azimuth_deg
     step = min(end - start, 360.0) / count
@@ -76,6 +78,6 @@ def _component_row(name: str, photos: NDArray[np.int64], rays: Array, count: int
     return {
         "name": name,
         "photos": photos.tolist(),
-        "spread_deg": spread_deg(unit(rays[photos])),
+        "spread_deg": reconstruction.spread_deg(reconstruction.unit(rays[photos])),
         "remark": f"seen in {len(photos)} of {count} photos only: take some from where it is not hidden" if few else "",
     }

@@ -5,12 +5,8 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable, Sequence
 
-from arview.cad.part import Part
-from arview.station.live.security.access import Access
-from arview.station.live.security.addresses import LOOPBACK
-from arview.station.live.server.live_server import open_endpoint
-from arview.station.live.server.uvicorn_server import UvicornServer
-from arview.station.live.server.workers import WorkerPool
+from arview.cad import Part
+from arview.station import live
 from arview.station.studio.app import make_app
 from arview.station.studio.document import StudioDocument
 
@@ -33,9 +29,9 @@ class StudioServer:
     """
 
     def __init__(self, document: StudioDocument, port: int, others: Sequence[Part] = ()) -> None:
-        self._endpoint = open_endpoint(None, port, is_plain=True)
-        self.access = Access.to([LOOPBACK, "localhost"], self._endpoint.port, is_secure=False)
-        self._server = UvicornServer(make_app(document, self.access, others), self._endpoint.listener)
+        self._endpoint = live.open_endpoint(None, port, is_plain=True)
+        self.access = live.Access.to([live.LOOPBACK, "localhost"], self._endpoint.port, is_secure=False)
+        self._server = live.UvicornServer(make_app(document, self.access, others), self._endpoint.listener)
 
     @property
     def port(self) -> int:
@@ -45,7 +41,7 @@ class StudioServer:
     @property
     def link(self) -> str:
         """URL of the page with the token of this run."""
-        return f"http://{LOOPBACK}:{self.port}/?token={self.access.token}"
+        return f"http://{live.LOOPBACK}:{self.port}/?token={self.access.token}"
 
     def stop(self) -> None:
         """Make `serve` end."""
@@ -54,7 +50,7 @@ class StudioServer:
     async def serve(self, on_ready: Callable[[], None] = lambda: None) -> None:
         """Serve until `stop`."""
         # Work that is under way when the server ends is not waited for.
-        asyncio.get_running_loop().set_default_executor(WorkerPool(WORKERS, WORK_TIMEOUT_S))
+        asyncio.get_running_loop().set_default_executor(live.WorkerPool(WORKERS, WORK_TIMEOUT_S))
         task = asyncio.ensure_future(self._server.run_until_stopped())
         on_ready()
         await task

@@ -11,16 +11,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.cad.part import Part
-from arview.camera import Camera
-from arview.camera.read import guess_camera, load_camera
+from arview import guideviews, overlay, tracking
+from arview.cad import Part
+from arview.camera import Camera, guess_camera, load_camera
 from arview.detection import Detector
 from arview.errors import InputError
-from arview.guideviews import GuideViewSet
-from arview.guideviews.cache import cached_guide_views
-from arview.overlay import OverlayRenderer
 from arview.pose import Pose, TrackingState
-from arview.tracking import TrackingSession
 from arview.video import open_source
 
 Image = NDArray[np.uint8]
@@ -58,11 +54,11 @@ class Trials:
                 raise InputError(f"{path.name}: there is no picture in it")
             height, width = images[0].shape[:2]
             camera = load_camera(camera_spec, width, height) if camera_spec else guess_camera(width, height)
-            views = cached_guide_views(part.model, part.effective_view_range)
+            views = guideviews.cached_guide_views(part.model, part.effective_view_range)
             found = self._detect(part, views, camera, images[0]) if len(images) == 1 else None
             return found or self._track(part, views, camera, images)
 
-    def _detect(self, part: Part, views: GuideViewSet, camera: Camera, image: Image) -> dict[str, Any]:
+    def _detect(self, part: Part, views: guideviews.GuideViewSet, camera: Camera, image: Image) -> dict[str, Any]:
         found = Detector(views, camera).detect(image)
         best = found[0] if found else None
         pose = Pose(
@@ -79,8 +75,8 @@ class Trials:
             reason = f"ambiguous: {len(best.alternatives)} other poses fit as well"
         return {"frames": 1, "tracked": int(best is not None), "quality": pose.quality, "reason": reason}
 
-    def _track(self, part: Part, views: GuideViewSet, camera: Camera, images: list[Image]) -> dict[str, Any]:
-        session = TrackingSession(views, camera, part.model)
+    def _track(self, part: Part, views: guideviews.GuideViewSet, camera: Camera, images: list[Image]) -> dict[str, Any]:
+        session = tracking.TrackingSession(views, camera, part.model)
         poses = [session.process(image, index, index / 30.0) for index, image in enumerate(images)]
         tracked = [pose for pose in poses if pose.state is TrackingState.TRACKED]
         shown = max(poses, key=lambda pose: pose.quality)
@@ -95,6 +91,6 @@ class Trials:
         }
 
     def _draw(self, part: Part, camera: Camera, image: Image, pose: Pose) -> None:
-        drawn = OverlayRenderer(part.model, camera).draw(image, pose)
+        drawn = overlay.OverlayRenderer(part.model, camera).draw(image, pose)
         _, jpeg = cv2.imencode(".jpg", cv2.cvtColor(drawn, cv2.COLOR_RGB2BGR))
         self.picture = jpeg.tobytes()

@@ -15,22 +15,18 @@ from typing import Any, Protocol
 import numpy as np
 from PIL import Image
 
-from arview.cad.part import Part
-from arview.camera import Camera
-from arview.camera.exif import HEIF_SUFFIXES, PHOTO_SUFFIXES
+from arview import reconstruction
+from arview.cad import Part
+from arview.camera import HEIF_SUFFIXES, PHOTO_SUFFIXES, Camera
 from arview.core.atomic import write_file
 from arview.errors import OutputError, is_interruption
 from arview.pose import Pose
-from arview.reconstruction.run import camera_summary
-from arview.station.capture import CaptureAdvice, CaptureGuide, CaptureOptions
-from arview.station.capture.information import focal_px
-from arview.station.capture.options import TriggerOptions
+from arview.station import capture
 from arview.station.walk.job import FORMAT, VERSION, JobFolder
 from arview.version import __version__
-from arview.video import Frame, FrameSource
-from arview.video.pictures import PictureSource
+from arview.video import Frame, FrameSource, PictureSource
 
-FRAME_TRIGGER = TriggerOptions(motion_per_s=(0.4, 0.6), still_s=0.0, min_focus=0.85, min_interval_s=0.2)
+FRAME_TRIGGER = capture.TriggerOptions(motion_per_s=(0.4, 0.6), still_s=0.0, min_focus=0.85, min_interval_s=0.2)
 """Trigger where the frame is the photo: there is no delay between the two, and blur is seen in the photo itself."""
 JPEG_QUALITY = 97
 _MAKE, _MODEL, _SOFTWARE, _EXIF_IFD = 0x010F, 0x0110, 0x0131, 0x8769
@@ -60,7 +56,7 @@ class CaptureSummary:
 
     photos: tuple[str, ...] = ()
     frames: int = 0
-    advice: CaptureAdvice | None = None
+    advice: capture.CaptureAdvice | None = None
     reasons: Mapping[str, int] = field(default_factory=dict)
     is_interrupted: bool = False
     ended_reason: str = ""
@@ -108,8 +104,8 @@ def capture_photos(
     part: Part,
     camera_of: Callable[[int], Camera],
     job: JobFolder,
-    options: CaptureOptions | None = None,
-    progress: Callable[[int, CaptureAdvice], None] | None = None,
+    options: capture.CaptureOptions | None = None,
+    progress: Callable[[int, capture.CaptureAdvice], None] | None = None,
 ) -> CaptureSummary:
     """Track a part through a source and keep the frames that guided capture asks for, until they suffice.
 
@@ -128,12 +124,12 @@ def capture_photos(
     Raises:
         OutputError: a photo cannot be written; those before it are kept.
     """
-    options = options or CaptureOptions(trigger=FRAME_TRIGGER)
+    options = options or capture.CaptureOptions(trigger=FRAME_TRIGGER)
     guide = _FollowingGuide(part, options)
     began = datetime.now(UTC)
     photos: list[str] = []
     reasons: Counter[str] = Counter()
-    advice: CaptureAdvice | None = None
+    advice: capture.CaptureAdvice | None = None
     frames, is_interrupted = 0, False
     try:
         for frame in source:
@@ -146,7 +142,7 @@ def capture_photos(
                 content = _content(frame, source, camera, taken)
                 hint = {
                     "cam_from_model": pose.cam_from_model.ravel().tolist(),
-                    "camera": camera_summary(camera),
+                    "camera": reconstruction.camera_summary(camera),
                     "quality": pose.quality,
                 }
                 photos.append(job.add_photo(content, hashlib.sha256(content).hexdigest(), "station", hint, taken))
@@ -170,17 +166,17 @@ def capture_photos(
 class _FollowingGuide:
     """The guide for a camera that may be replaced while it is estimated; the photos taken are kept."""
 
-    def __init__(self, part: Part, options: CaptureOptions) -> None:
+    def __init__(self, part: Part, options: capture.CaptureOptions) -> None:
         self._part, self._options = part, options
         self._camera: Camera | None = None
-        self._guide: CaptureGuide | None = None
+        self._guide: capture.CaptureGuide | None = None
         self._poses: list[Any] = []
 
-    def of(self, camera: Camera) -> CaptureGuide:
+    def of(self, camera: Camera) -> capture.CaptureGuide:
         """The guide for a camera."""
         if self._guide is None or camera is not self._camera:
             self._camera = camera
-            self._guide = CaptureGuide(self._part, camera, self._options, self._poses)
+            self._guide = capture.CaptureGuide(self._part, camera, self._options, self._poses)
         return self._guide
 
     def taken(self, pose: Pose) -> None:
@@ -201,7 +197,7 @@ def _content(frame: Frame, source: FrameSource, camera: Camera, taken: datetime)
     exif = Image.Exif()
     exif[_MAKE], exif[_MODEL], exif[_SOFTWARE] = "arview", "capture", f"arview {__version__}"
     longer, diagonal = max(camera.width, camera.height), float(np.hypot(camera.width, camera.height))
-    equivalent_mm = round(focal_px(camera) * float(np.hypot(36.0, 24.0)) / diagonal)
+    equivalent_mm = round(capture.focal_px(camera) * float(np.hypot(36.0, 24.0)) / diagonal)
     details: dict[int, Any] = {_TAKEN: f"{taken:%Y:%m:%d %H:%M:%S}"}
     if 1 <= equivalent_mm <= 1000 and longer > 0:
         details[_FOCAL_LENGTH_35MM] = equivalent_mm
@@ -244,9 +240,9 @@ def summary_lines(summary: CaptureSummary, part: Part) -> list[str]:
     return lines
 
 
-def capture_options(count: int | None) -> CaptureOptions:
+def capture_options(count: int | None) -> capture.CaptureOptions:
     """Options for a film or a station camera; ``count``: photos wanted, None for the usual number."""
-    options = CaptureOptions(trigger=FRAME_TRIGGER)
+    options = capture.CaptureOptions(trigger=FRAME_TRIGGER)
     if count is None:
         return options
     return replace(options, wanted_photos=count, max_photos=max(count, options.max_photos))

@@ -31,8 +31,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from arview.cad import Part
-from arview.cad.model import Model
+from arview.cad import Model, Part
 from arview.core.atomic import replacing
 from arview.core.durable import append_durably, replace_durably, set_aside, sync_folder
 from arview.errors import InputError, OutputError

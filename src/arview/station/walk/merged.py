@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from arview.cad.model import Model
+from arview.cad import Model
 from arview.inspection import ComponentDeviation, Inspection, Verdict
 from arview.station.walk.job import JobFolder
 

@@ -7,20 +7,11 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from threading import Event, Thread
 
+from arview import reconstruction, workflow
 from arview.errors import ArviewError
 from arview.geometry import Array
-from arview.reconstruction.intake.kept import kept
-from arview.reconstruction.intake.photos import read_and_check
-from arview.reconstruction.intake.reading import read_photo
-from arview.reconstruction.memory import SparseMemory
-from arview.reconstruction.pairs import KnownPairs
-from arview.reconstruction.run import reconstruct
-from arview.reconstruction.sparse import match_by_appearance, moving_features
-from arview.reconstruction.still import MAX_SHIFT_PX
-from arview.reconstruction.types import Photo
 from arview.station.walk.job import JobFolder
 from arview.station.walk.records import StoredPhoto
-from arview.workflow.prepare import Prepared
 
 
 @dataclass
@@ -37,10 +28,10 @@ class PhotoPreparation:
     """
 
     job: JobFolder
-    prepared: Prepared
-    memory: SparseMemory
+    prepared: workflow.Prepared
+    memory: reconstruction.SparseMemory
     threads: int
-    also: Callable[[Sequence[Photo]], None]
+    also: Callable[[Sequence[reconstruction.Photo]], None]
     ready: int = 0
     _ends: Event = field(default_factory=Event)
     _thread: Thread | None = None
@@ -71,16 +62,18 @@ class PhotoPreparation:
         newest = paths[-1]
         options = replace(self.prepared.reconstruct, last_stage="photos")
         try:
-            read_and_check(newest, newest.name)
-            kept("picture", newest, lambda: read_photo(newest))
-            intake = reconstruct(
+            reconstruction.read_and_check(newest, newest.name)
+            reconstruction.kept("picture", newest, lambda: reconstruction.read_photo(newest))
+            intake = reconstruction.reconstruct(
                 paths, self.job.path / "rough" / "photos", None, self.prepared.job.camera, options
             ).intake
             sparse = options.sparse
-            features, remarks = moving_features(intake.photos, sparse, self.threads, _nothing, self.memory)
-            min_move_px = MAX_SHIFT_PX if remarks else 0.0
-            known = KnownPairs(poses=poses_of(photos))
-            match_by_appearance(
+            features, remarks = reconstruction.moving_features(
+                intake.photos, sparse, self.threads, _nothing, self.memory
+            )
+            min_move_px = reconstruction.MAX_SHIFT_PX if remarks else 0.0
+            known = reconstruction.KnownPairs(poses=poses_of(photos))
+            reconstruction.match_by_appearance(
                 intake.photos,
                 features,
                 sparse,

@@ -10,13 +10,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from threading import Thread
 
+from arview import reconstruction, workflow
 from arview.errors import ArviewError
-from arview.reconstruction.colmap import import_pycolmap
-from arview.reconstruction.intake.kept import keeping_photos
 from arview.station.walk.job import JobFolder
 from arview.station.walk.recheck import RecheckWorker
 from arview.station.walk.worker import WalkWorker
-from arview.workflow.lock import exclusive_access
 
 NICENESS = 5
 """Niceness of the process while the user waits …."""
@@ -29,7 +27,7 @@ def main(arguments: Sequence[str]) -> int:
         return 2
     # Files appear complete or not at all and stages are recorded when they are finished, so that the process may end
     # at any moment. The work has a thread of its own, because signals are handled only between steps of the main one.
-    import_pycolmap()  # here, because its logging takes over the signals when it is loaded
+    reconstruction.import_pycolmap()  # here, because its logging takes over the signals when it is loaded
     signal.signal(signal.SIGTERM, lambda number, frame: os._exit(143))
     result: list[int] = []
     thread = Thread(target=lambda: result.append(_run(Path(arguments[0]))), name="walk", daemon=True)
@@ -43,7 +41,7 @@ def _run(folder: Path) -> int:
     try:
         job = JobFolder.open(folder)
         os.nice(max(0, NICENESS - os.nice(0)))
-        with exclusive_access(job.path, ".worker.lock", waits=False), keeping_photos():
+        with workflow.exclusive_access(job.path, ".worker.lock", waits=False), reconstruction.keeping_photos():
             return 0 if worker_of(job).run() else 3
     except ArviewError as error:
         print(error, file=sys.stderr)

@@ -14,28 +14,18 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from arview import measurement, reconstruction, workflow
 from arview.cad import Part
 from arview.camera import Camera
 from arview.core.stage_cache import write_json
 from arview.errors import ArviewError, CannotMeasureError, InputError
 from arview.geometry import Array
-from arview.inspection import ComponentDeviation, Inspection, load_inspection, save_inspection
-from arview.inspection.summary import verdict_sentence
-from arview.measurement.again import check_not_datums, measure_again
-from arview.measurement.folder import MetricReconstruction
-from arview.reconstruction.added import AddedOptions, EarlierPhotos
-from arview.reconstruction.colmap import read_reconstruction, sparse_model_of
-from arview.reconstruction.gpu.device import torch_device
-from arview.reconstruction.memory import SparseMemory
-from arview.reconstruction.run import intake_summary, reconstruct, write_sparse
-from arview.reconstruction.scale.types import ScaleResult
-from arview.reconstruction.types import Photo, PosedPhoto, SparseModel
-from arview.rendering.renderers import ZBufferRenderer
+from arview.inspection import ComponentDeviation, Inspection, load_inspection, save_inspection, verdict_sentence
+from arview.rendering import ZBufferRenderer
 from arview.station.walk.job import JobFolder
 from arview.station.walk.preparation import photo_files, poses_of
 from arview.station.walk.worker import WalkWorker, prepared_of
 from arview.workflow.new_inspection import new_inspection
-from arview.workflow.prepare import Prepared
 
 _DRAWN_PX = 1000
 """Longer side at which components are drawn to find the features on them."""
@@ -56,38 +46,40 @@ class RecheckWorker(WalkWorker):
         if parent is None:
             raise InputError(f"job {job.id}: is no re-check")
         self.first = parent
-        self.memory = SparseMemory(parent.path / "features")
-        self.earlier: EarlierPhotos | None = None
+        self.memory = reconstruction.SparseMemory(parent.path / "features")
+        self.earlier: reconstruction.EarlierPhotos | None = None
 
-    def _wait_for_first_photo(self) -> Prepared:
+    def _wait_for_first_photo(self) -> workflow.Prepared:
         """Make the earlier photos ready, which needs none of the new ones."""
         if self.state.stage == "done":
             return prepared_of(self.first)
         self._say(text="reading the first measurement")
         prepared = prepared_of(self.first)
-        check_not_datums(prepared.part, self.job.components or ())
+        measurement.check_not_datums(prepared.part, self.job.components or ())
         self.scale, whole, photos = read_first(self.first)
         before = load_inspection(self.first.path / "inspection.json", prepared.part.model)
         hides = Hides(prepared.part, before, self.job.components or (), whole, self.scale)
-        options = AddedOptions(sparse=prepared.reconstruct.sparse)
-        self.earlier = EarlierPhotos(whole, photos, hides, options, self.memory)
+        options = reconstruction.AddedOptions(sparse=prepared.reconstruct.sparse)
+        self.earlier = reconstruction.EarlierPhotos(whole, photos, hides, options, self.memory)
         super()._wait_for_first_photo()
         return prepared
 
-    def _prepare_more(self, photos: Sequence[Photo]) -> None:
+    def _prepare_more(self, photos: Sequence[reconstruction.Photo]) -> None:
         """Match new photos with those of the first measurement."""
         if self.earlier is None:
             return
         sparse = self.earlier.options.sparse
-        features = [self.memory.features(photo, sparse.features, torch_device(sparse.device)) for photo in photos]
+        features = [
+            self.memory.features(photo, sparse.features, reconstruction.torch_device(sparse.device)) for photo in photos
+        ]
         poses = {name: self._from_scan(pose) for name, pose in poses_of(self.job.photos()).items()}
         self.earlier.match(photos, features, poses)
 
-    def _measure_roughly(self, prepared: Prepared, count: int) -> bool:
+    def _measure_roughly(self, prepared: workflow.Prepared, count: int) -> bool:
         """A re-check has so few photos that it is measured once."""
         return True
 
-    def _finish(self, prepared: Prepared) -> None:
+    def _finish(self, prepared: workflow.Prepared) -> None:
         """The measurement of the components in the new photos."""
         if self.state.stage == "done":
             return
@@ -99,22 +91,24 @@ class RecheckWorker(WalkWorker):
         options = replace(prepared.reconstruct, last_stage="photos")
         source = photo_files(self.job, photos)
         try:
-            intake = reconstruct(source, self.job.path / "rough" / "photos", None, prepared.job.camera, options).intake
+            intake = reconstruction.reconstruct(
+                source, self.job.path / "rough" / "photos", None, prepared.job.camera, options
+            ).intake
         except InputError as error:
             raise CannotMeasureError(str(error)) from error
         new = [replace(photo, name=prefix + photo.name) for photo in intake.photos]
         poses = {prefix + name: self._from_scan(pose) for name, pose in poses_of(photos).items()}
         folder = self.job.path
         sparse = self.earlier.add(new, poses, folder / "sparse", self._progress())
-        write_sparse(folder / "sparse", sparse)
+        reconstruction.write_sparse(folder / "sparse", sparse)
         shutil.copyfile(self.first.path / "scale.json", folder / "scale.json")
-        listed = intake_summary(replace(intake, photos=(*self.earlier.photos, *new)))
+        listed = reconstruction.intake_summary(replace(intake, photos=(*self.earlier.photos, *new)))
         write_json(folder / "photos.json", listed)
         scale, frame = self.scale.scale, self.scale.model_from_scan
         assert scale is not None and frame is not None
-        metric = MetricReconstruction(sparse.transformed(scale, frame), self.scale, None)
+        metric = measurement.MetricReconstruction(sparse.transformed(scale, frame), self.scale, None)
         try:
-            found = measure_again(
+            found = measurement.measure_again(
                 metric,
                 prepared.part,
                 self.job.components or (),
@@ -171,7 +165,9 @@ class RecheckWorker(WalkWorker):
             update_reports(self.first.path)
 
 
-def read_first(first: JobFolder) -> tuple[ScaleResult, SparseModel, list[Photo]]:
+def read_first(
+    first: JobFolder,
+) -> tuple[reconstruction.ScaleResult, reconstruction.SparseModel, list[reconstruction.Photo]]:
     """Scale, sparse model in the scan frame and photos of a finished measurement.
 
     Raises:
@@ -179,10 +175,12 @@ def read_first(first: JobFolder) -> tuple[ScaleResult, SparseModel, list[Photo]]
     """
     folder = first.path
     try:
-        scale = ScaleResult.from_provenance(json.loads((folder / "scale.json").read_text(encoding="utf-8")))
+        scale = reconstruction.ScaleResult.from_provenance(
+            json.loads((folder / "scale.json").read_text(encoding="utf-8"))
+        )
         entries: list[dict[str, Any]] = json.loads((folder / "photos.json").read_text(encoding="utf-8"))["photos"]
         photos = [_photo(entry, folder) for entry in entries]
-        sparse = sparse_model_of(read_reconstruction(folder / "sparse" / "model"), photos)
+        sparse = reconstruction.sparse_model_of(reconstruction.read_reconstruction(folder / "sparse" / "model"), photos)
         covariance = folder / "sparse" / "covariance.npy"
         if covariance.is_file():
             sparse = replace(sparse, pose_covariance=np.load(covariance))
@@ -193,12 +191,12 @@ def read_first(first: JobFolder) -> tuple[ScaleResult, SparseModel, list[Photo]]
     return scale, sparse, photos
 
 
-def _photo(entry: Mapping[str, Any], folder: Path) -> Photo:
+def _photo(entry: Mapping[str, Any], folder: Path) -> reconstruction.Photo:
     """A photo of ``photos.json``, where it is now; its camera is a placeholder for that of the model."""
     name, width, height = str(entry["name"]), int(entry["width"]), int(entry["height"])
     path = folder / "photos" / name if (folder / "photos" / name).is_file() else Path(str(entry["path"]))
     camera = Camera(width, height, float(width), float(width), 0.5 * width, 0.5 * height)
-    return Photo(name, path, width, height, str(entry["lens"]), camera)
+    return reconstruction.Photo(name, path, width, height, str(entry["lens"]), camera)
 
 
 class Hides:
@@ -213,10 +211,17 @@ class Hides:
     """
 
     def __init__(
-        self, part: Part, before: Inspection, components: Sequence[str], whole: SparseModel, scale: ScaleResult
+        self,
+        part: Part,
+        before: Inspection,
+        components: Sequence[str],
+        whole: reconstruction.SparseModel,
+        scale: reconstruction.ScaleResult,
     ) -> None:
         assert scale.scale is not None and scale.model_from_scan is not None
-        self.photos: tuple[PosedPhoto, ...] = whole.transformed(scale.scale, scale.model_from_scan).photos
+        self.photos: tuple[reconstruction.PosedPhoto, ...] = whole.transformed(
+            scale.scale, scale.model_from_scan
+        ).photos
         self.model = part.model.only(list(components))
         moved = [one.distance_mm for one in before.components if one.name in components]
         self.margin_mm = 1.0 + max([_UNKNOWN_MM if one is None else one for one in moved], default=_UNKNOWN_MM)

@@ -14,21 +14,16 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from typing import Any
 
+from arview import reconstruction, workflow
 from arview.cad import Part
 from arview.core.progress import Progress
 from arview.errors import ArviewError, InputError, MismatchError
-from arview.inspection import Inspection, save_inspection
-from arview.inspection.summary import verdict_sentence
-from arview.reconstruction.memory import SparseMemory
-from arview.reconstruction.pairs import KnownPairs
-from arview.reconstruction.run import reconstruct
-from arview.reconstruction.types import Photo
+from arview.inspection import Inspection, save_inspection, verdict_sentence
+from arview.quality import history
 from arview.station.walk.job import JobFolder
 from arview.station.walk.preparation import PhotoPreparation, photo_files, poses_of
 from arview.station.walk.records import WalkState
-from arview.workflow.job import InspectJob
-from arview.workflow.prepare import Prepared, prepare
-from arview.workflow.run import Outcome, inspect_prepared, measured_in_photos
+from arview.workflow.prepare import prepare
 
 _POLL_S = 0.1
 
@@ -53,7 +48,7 @@ class WalkWorker:
     def __init__(self, job: JobFolder) -> None:
         self.job = job
         self.state = job.state()
-        self.memory = SparseMemory(job.path / "features")
+        self.memory = reconstruction.SparseMemory(job.path / "features")
         self.threads = os.cpu_count() or 1
 
     def run(self) -> bool:
@@ -83,7 +78,7 @@ class WalkWorker:
             self.state = WalkState(photos=len(self.job.photos()), is_rough=is_rough, inspection=kept)
             self._say(text="starting")
 
-    def _wait_for_first_photo(self) -> Prepared:
+    def _wait_for_first_photo(self) -> workflow.Prepared:
         """The inputs of the measurement, which can be checked from the first photo on."""
         if self.state.stage == "collecting":
             self._say(text="waiting for photos")
@@ -93,7 +88,7 @@ class WalkWorker:
             time.sleep(_POLL_S)
         return prepared_of(self.job)
 
-    def _collect(self, prepared: Prepared) -> None:
+    def _collect(self, prepared: workflow.Prepared) -> None:
         """Work ahead until the walk ends, and measure roughly in between."""
         preparation = PhotoPreparation(self.job, prepared, self.memory, self.threads, self._prepare_more)
         preparation.start()
@@ -112,13 +107,15 @@ class WalkWorker:
         finally:
             preparation.end()
 
-    def _prepare_more(self, photos: Sequence[Photo]) -> None:
+    def _prepare_more(self, photos: Sequence[reconstruction.Photo]) -> None:
         """What else is found as soon as photos arrive."""
 
-    def _measure_roughly(self, prepared: Prepared, count: int) -> bool:
+    def _measure_roughly(self, prepared: workflow.Prepared, count: int) -> bool:
         """A provisional measurement of the first photos, given up when the walk ends; whether it could be made."""
         folder, photos = self.job.path / "rough", self.job.photos()[:count]
-        options = replace(prepared.reconstruct, last_stage="scale", known=KnownPairs(poses=poses_of(photos)))
+        options = replace(
+            prepared.reconstruct, last_stage="scale", known=reconstruction.KnownPairs(poses=poses_of(photos))
+        )
 
         def tell(what: str, done: int, total: int) -> None:
             # COLMAP calls back from its own code, which is not left by an exception.
@@ -126,7 +123,7 @@ class WalkWorker:
                 raise _WalkEndedError
 
         try:
-            found = reconstruct(
+            found = reconstruction.reconstruct(
                 photo_files(self.job, photos),
                 folder,
                 prepared.part,
@@ -135,7 +132,7 @@ class WalkWorker:
                 progress=tell,
                 memory=self.memory,
             )
-            inspection = measured_in_photos(found, prepared, tell)
+            inspection = workflow.measured_in_photos(found, prepared, tell)
         except (_WalkEndedError, ArviewError):
             return False
         note = f"provisional: from the first {count} photos, while more are taken"
@@ -152,12 +149,12 @@ class WalkWorker:
 
     # --- after the end -----------------------------------------------------------------------------------
 
-    def _finish(self, prepared: Prepared) -> None:
+    def _finish(self, prepared: workflow.Prepared) -> None:
         """The measurement of all photos, its verdict, and in the background the cloud and the report."""
         self.job.remove_unconfirmed()
         photos = self.job.photos()
         prepared = replace(
-            prepared, reconstruct=replace(prepared.reconstruct, known=KnownPairs(poses=poses_of(photos)))
+            prepared, reconstruct=replace(prepared.reconstruct, known=reconstruction.KnownPairs(poses=poses_of(photos)))
         )
         was_done = self.state.stage == "done"
         first: list[Inspection] = []
@@ -172,7 +169,7 @@ class WalkWorker:
         if not was_done:
             self._say(stage="measuring", text="measuring", photos=len(photos), cloud="waiting")
         try:
-            outcome = inspect_prepared(
+            outcome = workflow.inspect_prepared(
                 prepared, self.job.path, progress=self._progress(), memory=self.memory, on_verdict=on_verdict
             )
         except ArviewError as error:
@@ -208,7 +205,7 @@ class WalkWorker:
         except ArviewError as error:
             self._say(text=f"{self.state.text}; no report: {error}")
 
-    def _say_cloud(self, first: Inspection, outcome: Outcome) -> None:
+    def _say_cloud(self, first: Inspection, outcome: workflow.Outcome) -> None:
         """The end of the background's work; a verdict that it changed is named."""
         before = {one.name: one.verdict for one in first.components}
         changed = [
@@ -227,9 +224,7 @@ class WalkWorker:
         if not store:
             return
         try:
-            from arview.quality.history import HistoryStore
-
-            with HistoryStore(store) as opened:
+            with history.HistoryStore(store) as opened:
                 opened.add(self.job.path / "inspection.json")
         except ArviewError as error:
             self._say(text=f"{self.state.text}; not added to the history: {error}")
@@ -250,7 +245,7 @@ class WalkWorker:
         self.job.write_state(self.state)
 
 
-def prepared_of(job: JobFolder) -> Prepared:
+def prepared_of(job: JobFolder) -> workflow.Prepared:
     """Inputs of a job's measurement.
 
     Raises:
@@ -259,7 +254,7 @@ def prepared_of(job: JobFolder) -> Prepared:
     """
     document = job.document
     prepared = prepare(
-        InspectJob(
+        workflow.InspectJob(
             str(document["part"]),
             str(job.path / "photos"),
             serial=job.serial,

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from arview.camera import Camera
 from arview.errors import InputError
-from arview.fiducials.serial_code import SerialCodeReader, SerialNumbers
+from arview.fiducials import SerialCodeReader, SerialNumbers
 from arview.geometry import Array
 from arview.guideviews import GuideViewSet
 from arview.pose import Identity, Pose

@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.detection.detector import Detection
+from arview.detection import Detection
 from arview.geometry import Array, exp_so3, rigid
 from arview.tracking.guided_init import GuidedPose
 from arview.tracking.identity.part_outline import PartOutline, PartPlace

@@ -15,12 +15,9 @@ from numpy.typing import NDArray
 from arview.camera import Camera
 from arview.core.kernel import kernel
 from arview.core.parallel import pool
-from arview.detection.features.response_maps import response_maps, score_around
-from arview.detection.search.nms import select_distinct
-from arview.detection.search.pattern_search import search_poses
+from arview.detection import response_maps, score_around, search_poses, select_distinct
 from arview.geometry import Array, turn_ball
-from arview.refinement.modalities.region import BINS, ColorModel
-from arview.refinement.projection import ViewArrays
+from arview.refinement import BINS, ColorModel, ViewArrays
 
 RADII_PX = (26.0, 52.0)
 """Half diameter of the part in the pictures of the two rounds."""

@@ -18,11 +18,16 @@ from numpy.typing import NDArray
 
 from arview.camera import Camera
 from arview.geometry import Array
-from arview.refinement.gauss_newton import apply_twist
-from arview.refinement.kernels import STRENGTH_HALF, nearest_view
-from arview.refinement.modalities.edge import EdgeProfiles, measure_edges
-from arview.refinement.projection import ProjectedLines, project_lines
-from arview.refinement.view_model import PartView
+from arview.refinement import (
+    STRENGTH_HALF,
+    EdgeProfiles,
+    PartView,
+    ProjectedLines,
+    apply_twist,
+    measure_edges,
+    nearest_view,
+    project_lines,
+)
 from arview.tracking.self_calibration.edge_lines import (
     POSE_COLUMNS,
     EdgeEquations,

@@ -9,9 +9,8 @@ from numpy.typing import NDArray
 
 from arview.core.kernel import kernel
 from arview.geometry import Array
-from arview.guideviews.mesh_edges import EDGE_SHARP
-from arview.refinement.modalities.edge import CUT_OFF, HYPOTHESES, EdgeProfiles
-from arview.refinement.projection import ProjectedLines, project
+from arview.guideviews import EDGE_SHARP
+from arview.refinement import CUT_OFF, HYPOTHESES, EdgeProfiles, ProjectedLines, project
 
 POSE_COLUMNS, SHARED_COLUMNS = 6, 4
 """Unknowns of a pose, and of the camera: logarithm of the focal length, principal point (2), radial distortion k1."""

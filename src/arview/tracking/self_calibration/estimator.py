@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from arview.camera import Camera
 from arview.geometry import Array
 from arview.pose import Pose
-from arview.refinement.view_model import PartView
+from arview.refinement import PartView
 from arview.tracking.self_calibration.adjustment import Adjusted, FocalAdjustment
 from arview.tracking.self_calibration.frame_set import CalibrationFrame, FrameSet, cropped_frame
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from arview.camera import Camera
 from arview.geometry import Array
-from arview.refinement.modalities.edge import smoothed
+from arview.refinement import smoothed
 
 MAX_FRAMES = 30
 """Frames kept at most; of more, those with the least information on the focal length are left out."""

@@ -6,9 +6,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from arview.camera.exif import PhotoExif
-from arview.camera.profiles import exif_of_video, lens_record, profile_path
-from arview.camera.write import write_camera
+from arview.camera import PhotoExif, exif_of_video, lens_record, profile_path, write_camera
 from arview.errors import OutputError
 from arview.tracking.self_calibration.estimator import FocalEstimate
 from arview.version import __version__

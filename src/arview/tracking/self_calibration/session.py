@@ -16,7 +16,7 @@ from arview.camera import Camera
 from arview.geometry import Array
 from arview.guideviews import GuideViewSet
 from arview.pose import Pose, TrackingState
-from arview.refinement.view_model import PartView
+from arview.refinement import PartView
 from arview.tracking.identity import IdentityMonitor
 from arview.tracking.self_calibration.estimator import FocalEstimate, FocalEstimator, pose_seen_by
 from arview.tracking.session import TrackingSession

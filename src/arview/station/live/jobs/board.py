@@ -8,14 +8,14 @@ from collections import OrderedDict
 from contextlib import suppress
 from pathlib import Path
 
-from arview.cad.model import Model
+from arview.cad import Model
 from arview.errors import ArviewError, InputError, OutputError
 from arview.inspection import Inspection, load_inspection
+from arview.station import walk
 from arview.station.live.jobs.uploads import PhotoSpace, Uploads
 from arview.station.live.options import JobOptions
 from arview.station.live.security.refusals import Refusal
 from arview.station.live.stream.subject import Subject
-from arview.station.walk.job import JobFolder, jobs_in
 
 MAX_JOBS = 5000
 """Jobs that the folder may hold."""
@@ -41,20 +41,20 @@ class JobBoard:
         self.options = options
         self.space = PhotoSpace(options)
         self._lock = threading.RLock()
-        self._known: dict[str, JobFolder] = {}
+        self._known: dict[str, walk.JobFolder] = {}
         self._uploads: dict[str, Uploads] = {}
         self._inspections: OrderedDict[Path, tuple[_FileState, Inspection | None]] = OrderedDict()
 
-    def jobs(self) -> list[JobFolder]:
+    def jobs(self) -> list[walk.JobFolder]:
         """All jobs, oldest first, each followed by its re-checks."""
         if not self.options.folder.is_dir():
             return []
-        found = jobs_in(self.options.folder)
+        found = walk.jobs_in(self.options.folder)
         with self._lock:
             self._known = {job.id: job for job in found}
         return found
 
-    def find(self, job_id: str) -> JobFolder:
+    def find(self, job_id: str) -> walk.JobFolder:
         """The job of a name.
 
         Raises:
@@ -68,7 +68,7 @@ class JobBoard:
             raise Refusal(404, "no_such_job", "there is no such inspection at this station")
         return job
 
-    def start(self, subject: Subject, serial: str, camera: str | None) -> tuple[JobFolder, bool]:
+    def start(self, subject: Subject, serial: str, camera: str | None) -> tuple[walk.JobFolder, bool]:
         """Start a job for a specimen, or find the one that is not finished; returns it and whether it is new.
 
         Raises:
@@ -85,7 +85,7 @@ class JobBoard:
                 raise Refusal(507, "disk_full", f"the station holds {len(jobs)} inspections; move some")
             self.space.check(0)
             try:
-                job = JobFolder.create(self.options.folder, subject.part, subject.path or "", serial, camera)
+                job = walk.JobFolder.create(self.options.folder, subject.part, subject.path or "", serial, camera)
             except InputError as error:
                 raise Refusal(400, "bad_request", str(error)) from error
             except OutputError as error:
@@ -94,7 +94,7 @@ class JobBoard:
         logger.info("inspection %s started", job.id)
         return job, True
 
-    def recheck(self, job: JobFolder, components: list[str]) -> JobFolder:
+    def recheck(self, job: walk.JobFolder, components: list[str]) -> walk.JobFolder:
         """Make the job of a re-check.
 
         Raises:
@@ -113,14 +113,14 @@ class JobBoard:
             self._known[made.id] = made
         return made
 
-    def uploads(self, job: JobFolder) -> Uploads:
+    def uploads(self, job: walk.JobFolder) -> Uploads:
         """The uploads of a job; there is one object for each, because it holds a lock."""
         with self._lock:
             if job.id not in self._uploads:
                 self._uploads[job.id] = Uploads(job, self.options, self.space)
             return self._uploads[job.id]
 
-    def inspection(self, job: JobFolder, model: Model | None = None) -> Inspection | None:
+    def inspection(self, job: walk.JobFolder, model: Model | None = None) -> Inspection | None:
         """What was measured of a job, rough or final; None while nothing was, or where it cannot be read."""
         path = job.inspection_path
         if path is None:

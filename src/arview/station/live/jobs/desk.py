@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from arview.cad.part import Part
+from arview.cad import Part
 from arview.pose import Identity, Pose
+from arview.station import walk
 from arview.station.live.jobs.board import JobBoard
 from arview.station.live.jobs.guiding import Guiding
 from arview.station.live.jobs.records import tell_report_and_history
@@ -23,7 +24,6 @@ from arview.station.live.stream.documents import Document
 from arview.station.live.stream.feed import TrackedFrame
 from arview.station.live.stream.subject import Subject
 from arview.station.live.stream.subjects import Subjects
-from arview.station.walk.job import JobFolder
 
 WATCHED = ("state.json", "photos.jsonl", "inspection.json", "rough/inspection.json", "uploads")
 """Files and folders of a job that are read again when they change."""
@@ -52,7 +52,7 @@ class JobView:
         self._last: tuple[TrackedFrame, TrackedFrame] | None = None
 
     @property
-    def job(self) -> JobFolder:
+    def job(self) -> walk.JobFolder:
         """The job."""
         return self.subject.job
 
@@ -98,7 +98,7 @@ class JobView:
         return replace(pose, identity=Identity.OTHER, identity_reason=reason)
 
 
-def _tell_others(job: JobFolder) -> None:
+def _tell_others(job: walk.JobFolder) -> None:
     """A re-check that is measured is shown in the report of the first measurement."""
     if job.components is not None:
         tell_report_and_history(job)
@@ -163,7 +163,7 @@ class JobDesk:
         for view in views:
             view.refresh(self.board, self.workers)
 
-    def start(self, part: int, serial: str, camera: str | None) -> tuple[JobFolder, bool]:
+    def start(self, part: int, serial: str, camera: str | None) -> tuple[walk.JobFolder, bool]:
         """Start a job of a part, or find the one that is not finished. Raises Refusal, see `JobBoard.start`."""
         subjects = self._loaded()
         if not 0 <= part < len(subjects):
@@ -207,19 +207,19 @@ class JobDesk:
             if view.clients <= 0:
                 self._views.pop(view.job.id, None)
 
-    def part_of(self, job: JobFolder) -> int | None:
+    def part_of(self, job: walk.JobFolder) -> int | None:
         """Number of the part that a job measures; None where it is not shown."""
         subjects, model = self._loaded(), job.document["model_hash"]
         fitting = [number for number, one in enumerate(subjects) if one.part.model.source_hash == model]
         chosen = self._parts.get(job.id, self._parts.get(str(job.document.get("parent"))))
         return chosen if chosen in fitting else next(iter(fitting), None)
 
-    def subject(self, job: JobFolder) -> Subject | None:
+    def subject(self, job: walk.JobFolder) -> Subject | None:
         """The part that a job measures, as the server shows it without a job; None where it is not shown."""
         number = self.part_of(job)
         return None if number is None else self._loaded()[number]
 
-    def part(self, job: JobFolder) -> Part | None:
+    def part(self, job: walk.JobFolder) -> Part | None:
         """The part that a job measures; None where it is not shown."""
         subject = self.subject(job)
         return None if subject is None else subject.part
@@ -237,24 +237,24 @@ class JobDesk:
             if guiding in (guides := self._guides.get(view.job.id, [])):
                 guides.remove(guiding)
 
-    def guides(self, job: JobFolder) -> list[Guiding]:
+    def guides(self, job: walk.JobFolder) -> list[Guiding]:
         """Guided capture of all clients of a job."""
         with self._lock:
             return list(self._guides.get(job.id, []))
 
-    def announced(self, job: JobFolder, hint: Mapping[str, Any] | None) -> None:
+    def announced(self, job: walk.JobFolder, hint: Mapping[str, Any] | None) -> None:
         """A photo was taken; it need not have arrived."""
         given = None if hint is None else hint.get("cam_from_model")
         if given is not None:
             for guiding in self.guides(job):
                 guiding.photo_taken(np.array(given, dtype=np.float64).reshape(4, 4))
 
-    def lost(self, job: JobFolder) -> None:
+    def lost(self, job: walk.JobFolder) -> None:
         """A photo that was announced does not come."""
         for guiding in self.guides(job):
             guiding.start_again()
 
-    def changed(self, job: JobFolder) -> None:
+    def changed(self, job: walk.JobFolder) -> None:
         """A photo was stored, or the walk has ended or was reopened."""
         self.workers.ask(job)
         self.workers.tick()

@@ -6,24 +6,23 @@ import logging
 from dataclasses import asdict
 from typing import Any
 
+from arview import overlay
 from arview.errors import ArviewError
-from arview.inspection import Inspection, Verdict
-from arview.inspection.summary import overall_verdict, verdict_sentence
-from arview.overlay.labels import detail_text, value_text
-from arview.quality.decisions import attached_photos, decision_document, log_of, state_document, state_of_record
-from arview.quality.rework import instruction_document, instructions
+from arview.inspection import Inspection, Verdict, overall_verdict, verdict_sentence
+from arview.quality import decisions
+from arview.quality.rework import instruction_document, make_instructions
+from arview.station import walk
 from arview.station.live.jobs.board import JobBoard
 from arview.station.live.jobs.desk import JobDesk
 from arview.station.live.jobs.subject import is_open
 from arview.station.live.stream.documents import Document
 from arview.station.live.stream.phrases import messages_of, texts_of
-from arview.station.walk.job import JobFolder
-from arview.station.walk.merged import BeforeAfter, before_after, merged
+from arview.station.walk.merged import merged
 
 logger = logging.getLogger("arview.station.live")
 
 
-def job_row(job: JobFolder, board: JobBoard, part: int | None) -> Document:
+def job_row(job: walk.JobFolder, board: JobBoard, part: int | None) -> Document:
     """A job in the list."""
     state, inspection = job.state(), board.inspection(job)
     has_verdict = inspection is not None and not is_open(state)
@@ -41,7 +40,7 @@ def job_row(job: JobFolder, board: JobBoard, part: int | None) -> Document:
     }
 
 
-def job_document(job: JobFolder, desk: JobDesk) -> Document:
+def job_document(job: walk.JobFolder, desk: JobDesk) -> Document:
     """A job with its state, photos, numbers, instructions and decisions."""
     board, number = desk.board, desk.part_of(job)
     inspection = board.inspection(job)
@@ -52,7 +51,7 @@ def job_document(job: JobFolder, desk: JobDesk) -> Document:
         "state": job.state().document(),
         "is_ended": job.is_ended,
         "photos": [photo.name for photo in job.photos()],
-        "attachments": attached_photos((job.parent or job).path),
+        "attachments": decisions.attached_photos((job.parent or job).path),
         "uploads": [
             {"upload": one.name, "bytes": one.bytes, "offset": one.offset} for one in board.uploads(job).listed()
         ],
@@ -68,13 +67,13 @@ def job_document(job: JobFolder, desk: JobDesk) -> Document:
     return {**told, "messages": messages} if messages else told
 
 
-def rework(job: JobFolder, desk: JobDesk) -> list[Document]:
+def rework(job: walk.JobFolder, desk: JobDesk) -> list[Document]:
     """Instructions for the components that are out of tolerance; of a measured job whose part is shown here."""
     part, inspection = desk.part(job), desk.board.inspection(job)
     if part is None or inspection is None or is_open(job.state()):
         return []
     try:
-        return [instruction_document(one) for one in instructions(part, inspection)]
+        return [instruction_document(one) for one in make_instructions(part, inspection)]
     except ArviewError as error:
         logger.warning("%s: %s", job.id, error)
         return []
@@ -91,8 +90,8 @@ def inspection_document(inspection: Inspection) -> Document:
             {
                 "name": one.name,
                 "verdict": str(one.verdict),
-                "value_text": value_text(one),
-                "detail_text": detail_text(one),
+                "value_text": overlay.value_text(one),
+                "detail_text": overlay.detail_text(one),
                 "distance_mm": one.distance_mm,
                 "uncertainty_mm": one.uncertainty_mm,
             }
@@ -101,29 +100,29 @@ def inspection_document(inspection: Inspection) -> Document:
     }
 
 
-def _decisions(job: JobFolder, inspection: Inspection | None) -> Document:
+def _decisions(job: walk.JobFolder, inspection: Inspection | None) -> Document:
     """The log of decisions, and what people decided together."""
-    entries = log_of(job.path).content().entries
+    entries = decisions.log_of(job.path).content().entries
     record: dict[str, Any] | None = None
     if inspection is not None and (job.path / "inspection.json").is_file():
         try:
-            record = state_document(state_of_record(job.path))
+            record = decisions.state_document(decisions.state_of_record(job.path))
         except ArviewError as error:
             record = {"sentence": str(error), "is_released": False, "signature": None, "faults": [str(error)]}
     signature = None if record is None else record["signature"]
     return {
-        "decisions": [decision_document(one) for one in entries],
+        "decisions": [decisions.decision_document(one) for one in entries],
         "signed": signature if signature is not None and not signature["void"] else None,
         "record": record,
     }
 
 
-def _before_after(job: JobFolder) -> list[Document]:
+def _before_after(job: walk.JobFolder) -> list[Document]:
     """Components of a re-check before it and now; empty for a first measurement."""
     if job.components is None:
         return []
     try:
-        rows = [asdict(one) for one in before_after(job)]
+        rows = [asdict(one) for one in walk.before_after(job)]
         known = merged(job) if not rows else None
     except ArviewError as error:
         logger.warning("%s: %s", job.id, error)
@@ -131,4 +130,6 @@ def _before_after(job: JobFolder) -> list[Document]:
     if known is None:
         return rows
     before = [one for name in job.components if (one := known.inspection.find(name)) is not None]
-    return [asdict(BeforeAfter(one.name, one.distance_mm, None, one.verdict, Verdict.NOT_MEASURED)) for one in before]
+    return [
+        asdict(walk.BeforeAfter(one.name, one.distance_mm, None, one.verdict, Verdict.NOT_MEASURED)) for one in before
+    ]

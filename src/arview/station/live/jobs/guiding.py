@@ -13,12 +13,11 @@ import numpy as np
 from arview.camera import Camera
 from arview.errors import ArviewError
 from arview.geometry import Array
-from arview.station.capture import CaptureAdvice, CaptureGuide, CaptureOptions, capture_document
+from arview.station import capture, walk
 from arview.station.live.jobs.board import JobBoard
 from arview.station.live.jobs.subject import JobSubject
 from arview.station.live.stream.documents import Document
 from arview.station.live.stream.feed import TrackedFrame
-from arview.station.walk.records import StoredPhoto
 
 logger = logging.getLogger("arview.station.live")
 
@@ -49,10 +48,10 @@ class Guiding:
         self.gyro_rad_s: float | None = None
         self._subject, self._number, self._board = subject, number, board
         self._lock = threading.Lock()
-        self._guide: CaptureGuide | None = None
+        self._guide: capture.CaptureGuide | None = None
         self._camera: Camera | None = None
         self._is_making = False
-        self._advice: CaptureAdvice | None = None
+        self._advice: capture.CaptureAdvice | None = None
         self._sent: tuple[int, tuple[str, ...]] | None = None
         self._sent_s = 0.0
 
@@ -74,7 +73,7 @@ class Guiding:
         has_components = news != self._sent or time.monotonic() - self._sent_s > REPEAT_S
         if has_components:
             self._sent, self._sent_s = news, time.monotonic()
-        return capture_document(advice, self._subject.job.id, has_components)
+        return capture.capture_document(advice, self._subject.job.id, has_components)
 
     def photo_taken(self, cam_from_model: Array) -> None:
         """A photo of the job was taken."""
@@ -108,7 +107,7 @@ class Guiding:
             try:
                 poses = known_poses(self._board, self._subject)
                 options = guide_options(self._subject, self._board, camera)
-                guide = CaptureGuide(self._subject.part, camera, options, poses, dome)
+                guide = capture.CaptureGuide(self._subject.part, camera, options, poses, dome)
                 with self._lock:
                     self._guide, self._made_for = guide, camera
             except ArviewError as error:
@@ -124,9 +123,9 @@ class Guiding:
         return self._made_for is not None and not _differs(self._made_for, camera)
 
 
-def guide_options(subject: JobSubject, board: JobBoard, camera: Camera) -> CaptureOptions:
+def guide_options(subject: JobSubject, board: JobBoard, camera: Camera) -> capture.CaptureOptions:
     """Options of the guide of a job: a re-check wants few photos, of its components; stills have more pixels."""
-    options = CaptureOptions()
+    options = capture.CaptureOptions()
     if (components := subject.job.components) is not None:
         options = replace(options, wanted_photos=RECHECK_PHOTOS, components=components)
     ratio = _still_ratio(subject.job.photos(), subject, camera)
@@ -142,7 +141,7 @@ def known_poses(board: JobBoard, subject: JobSubject) -> list[Array]:
     return [pose for pose in poses if pose is not None]
 
 
-def _still_ratio(photos: Sequence[StoredPhoto], subject: JobSubject, camera: Camera) -> float | None:
+def _still_ratio(photos: Sequence[walk.StoredPhoto], subject: JobSubject, camera: Camera) -> float | None:
     """Width of the last full-size photo over that of the stream; None without one."""
     from PIL import Image as Pillow
 

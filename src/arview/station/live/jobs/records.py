@@ -7,7 +7,8 @@ import os
 import threading
 
 from arview.errors import ArviewError
-from arview.station.walk.job import JobFolder
+from arview.quality import history
+from arview.station import walk
 
 logger = logging.getLogger("arview.station.live")
 
@@ -15,7 +16,7 @@ _WRITING = threading.Lock()
 """One report is changed at a time."""
 
 
-def tell_report_and_history(job: JobFolder) -> None:
+def tell_report_and_history(job: walk.JobFolder) -> None:
     """Put the decisions of a job into its report, and add them to the store of ``ARVIEW_STORE`` if there is one.
 
     The log of decisions holds them already: what goes wrong here is told, and mended by the next decision.
@@ -27,9 +28,7 @@ def tell_report_and_history(job: JobFolder) -> None:
 
             update_reports(job.path)
             if store := os.environ.get("ARVIEW_STORE"):
-                from arview.quality.history import HistoryStore
-
-                with HistoryStore(store) as opened:
+                with history.HistoryStore(store) as opened:
                     opened.add(inspection)
         except ArviewError as error:
             logger.warning("%s: %s", job.id, error)

@@ -8,13 +8,12 @@ from dataclasses import replace
 
 from arview.errors import ArviewError
 from arview.inspection import ComponentDeviation, Finding, Inspection
+from arview.station import walk
 from arview.station.live.jobs.board import JobBoard
 from arview.station.live.stream.inspection_file import age_notices
 from arview.station.live.stream.notices import Notice
 from arview.station.live.stream.subject import Subject
-from arview.station.walk.job import JobFolder
 from arview.station.walk.merged import merged
-from arview.station.walk.records import WalkState
 
 logger = logging.getLogger("arview.station.live")
 
@@ -37,11 +36,11 @@ class JobSubject(Subject):
         state: of the measurement.
     """
 
-    def __init__(self, base: Subject, job: JobFolder, board: JobBoard) -> None:
+    def __init__(self, base: Subject, job: walk.JobFolder, board: JobBoard) -> None:
         super().__init__(base.part, base.views, base.options, base.name, path=base.path)
         self.job, self.serial, self._board = job, job.serial, board
         self.revision = next(_REVISIONS)
-        self.state: WalkState = job.state()
+        self.state: walk.WalkState = job.state()
         self._shown: Inspection | None = None
         self._faults: tuple[str, ...] = ()
         self.reload()
@@ -83,7 +82,7 @@ class JobSubject(Subject):
         checked = self.job.components
         return frozenset(one.name for one in self.part.model.components) if checked is None else frozenset(checked)
 
-    def _merged(self, state: WalkState) -> Inspection | None:
+    def _merged(self, state: walk.WalkState) -> Inspection | None:
         """What is shown: of an unfinished job only components with a number, else the newest value of each."""
         model = self.part.model
         own = self._board.inspection(self.job, model)
@@ -106,7 +105,7 @@ class JobSubject(Subject):
         return replace(newest.inspection, components=(*latest, *kept))
 
 
-def is_open(state: WalkState) -> bool:
+def is_open(state: walk.WalkState) -> bool:
     """Whether numbers are still to come."""
     return state.stage in ("collecting", "measuring")
 

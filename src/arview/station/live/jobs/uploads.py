@@ -24,14 +24,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from arview.camera.exif import check_jpeg_scans
+from arview.camera import check_jpeg_scans
 from arview.core.atomic import write_file
 from arview.errors import InputError, OutputError
-from arview.quality.decisions import attach_photo, attached_photos
+from arview.quality import decisions
+from arview.station import walk
 from arview.station.live.options import JobOptions
 from arview.station.live.security.refusals import Refusal
-from arview.station.walk.job import JobFolder
-from arview.station.walk.records import PhotoOrigin, checked_hint, checked_time
 
 MAX_PHOTOS = 400
 """Photos of one inspection."""
@@ -74,7 +73,7 @@ class Upload:
     name: str
     bytes: int
     sha256: str
-    source: PhotoOrigin
+    source: walk.PhotoOrigin
     hint: Mapping[str, Any] | None
     taken: str
     offset: int = 0
@@ -90,7 +89,7 @@ class Uploads:
         space: bytes that may still be written to the folder of the jobs.
     """
 
-    def __init__(self, job: JobFolder, options: JobOptions, space: PhotoSpace) -> None:
+    def __init__(self, job: walk.JobFolder, options: JobOptions, space: PhotoSpace) -> None:
         self._job, self._options, self._space = job, options, space
         self._folder = job.path / "uploads"
         self._lock = threading.Lock()
@@ -187,8 +186,8 @@ class Uploads:
             raise Refusal(413, "too_large", f"the photo has more than {PHOTO_BYTES / 1e6:.0f} MB")
         if not isinstance(sha256, str) or _SHA256.fullmatch(sha256) is None:
             raise Refusal(400, "bad_request", "sha256: expected 64 hexadecimal digits in lower case")
-        if source not in get_args(PhotoOrigin):
-            raise Refusal(400, "bad_request", f"source: expected one of {', '.join(get_args(PhotoOrigin))}")
+        if source not in get_args(walk.PhotoOrigin):
+            raise Refusal(400, "bad_request", f"source: expected one of {', '.join(get_args(walk.PhotoOrigin))}")
         purpose = request.get("purpose", "measure")
         if purpose not in get_args(Purpose):
             raise Refusal(400, "bad_request", f"purpose: expected one of {', '.join(get_args(Purpose))}")
@@ -201,8 +200,8 @@ class Uploads:
                 size,
                 sha256,
                 source,
-                checked_hint(hint),
-                checked_time(request.get("taken")),
+                walk.checked_hint(hint),
+                walk.checked_time(request.get("taken")),
                 purpose=purpose,
             )
         except InputError as error:
@@ -213,13 +212,13 @@ class Uploads:
         for photo in self._job.photos():
             if _name_of(photo.sha256, "measure") == name:
                 return photo.name
-        for attached in attached_photos(record_folder(self._job)):
+        for attached in decisions.attached_photos(record_folder(self._job)):
             if _name_of(Path(attached).stem, "decide") == name:
                 return attached
         return None
 
     def _count(self, purpose: Purpose) -> int:
-        return len(self._job.photos() if purpose == "measure" else attached_photos(record_folder(self._job)))
+        return len(self._job.photos() if purpose == "measure" else decisions.attached_photos(record_folder(self._job)))
 
     def _known(self, name: str) -> Upload:
         upload = self._read(name)
@@ -328,10 +327,10 @@ class PhotoSpace:
 
 
 def store_photo(
-    job: JobFolder,
+    job: walk.JobFolder,
     content: bytes,
     sha256: str,
-    source: PhotoOrigin,
+    source: walk.PhotoOrigin,
     hint: Mapping[str, Any] | None,
     taken: str | None = None,
 ) -> str:
@@ -354,21 +353,21 @@ def store_photo(
         raise _not_stored(error) from error
 
 
-def store_attachment(job: JobFolder, content: bytes) -> str:
+def store_attachment(job: walk.JobFolder, content: bytes) -> str:
     """Store a photo that was taken for a decision, durably; returns its name. It is not measured.
 
     Raises:
         Refusal: the photo cannot be used, or the disk is full.
     """
     try:
-        return attach_photo(record_folder(job), content)
+        return decisions.attach_photo(record_folder(job), content)
     except InputError as error:
         raise Refusal(422, "bad_photo", str(error)) from error
     except OutputError as error:
         raise _not_stored(error) from error
 
 
-def record_folder(job: JobFolder) -> Path:
+def record_folder(job: walk.JobFolder) -> Path:
     """The folder of the record that a job belongs to: of a re-check that of the first measurement."""
     return (job.parent or job).path
 

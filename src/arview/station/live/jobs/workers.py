@@ -22,9 +22,8 @@ from pathlib import Path
 from typing import Literal
 
 from arview.errors import ArviewError
+from arview.station import walk
 from arview.station.live.options import JobOptions
-from arview.station.walk.job import JobFolder, start_worker
-from arview.station.walk.records import WalkState
 
 WORKER_PAUSES_S: tuple[float, ...] = (2.0, 10.0, 60.0)
 """Pauses before a measurement that broke is started again; after the last one it has failed."""
@@ -40,7 +39,7 @@ RECENT_S = 86400.0
 logger = logging.getLogger("arview.station.live")
 
 WorkerState = Literal["none", "waiting", "running", "failed"]
-Start = Callable[[JobFolder], "subprocess.Popen[bytes]"]
+Start = Callable[[walk.JobFolder], "subprocess.Popen[bytes]"]
 
 
 @dataclass
@@ -55,7 +54,7 @@ class _Entry:
         retry_s: monotonic time before which it is not started again.
     """
 
-    job: JobFolder
+    job: walk.JobFolder
     asked_s: float
     served_s: float = -1.0
     process: subprocess.Popen[bytes] | None = None
@@ -80,14 +79,14 @@ class WorkerQueue:
     """
 
     def __init__(
-        self, options: JobOptions, start: Start | None = None, on_done: Callable[[JobFolder], None] | None = None
+        self, options: JobOptions, start: Start | None = None, on_done: Callable[[walk.JobFolder], None] | None = None
     ) -> None:
-        self._options, self._start, self._on_done = options, start or start_worker, on_done
+        self._options, self._start, self._on_done = options, start or walk.start_worker, on_done
         self._lock = threading.RLock()
         self._entries: dict[str, _Entry] = {}
         self._is_closed = False
 
-    def resume(self, jobs: list[JobFolder]) -> None:
+    def resume(self, jobs: list[walk.JobFolder]) -> None:
         """Continue with jobs of an earlier run: those that are not finished, and workers that still run."""
         now_s, recent = time.monotonic(), time.time() - RECENT_S
         with self._lock:
@@ -98,7 +97,7 @@ class WorkerQueue:
                 self._entries[job.id] = _Entry(job, now_s, pid=pid, started_s=now_s)
                 logger.info("inspection %s %s", job.id, "is continued" if pid is None else "is still measured")
 
-    def ask(self, job: JobFolder) -> None:
+    def ask(self, job: walk.JobFolder) -> None:
         """Something has changed: a photo has come, the walk has ended, or it was reopened."""
         with self._lock:
             entry = self._entries.setdefault(job.id, _Entry(job, 0.0))
@@ -216,7 +215,7 @@ class WorkerQueue:
         entry.breaks += 1
 
 
-def running_worker(job: JobFolder) -> int | None:
+def running_worker(job: walk.JobFolder) -> int | None:
     """Process number of the worker of a job that an earlier server started, if it still runs."""
     try:
         pid = int(json.loads(_pid_path(job).read_text(encoding="utf-8"))["pid"])
@@ -225,16 +224,16 @@ def running_worker(job: JobFolder) -> int | None:
     return pid if _is_worker(pid, job) else None
 
 
-def _pid_path(job: JobFolder) -> Path:
+def _pid_path(job: walk.JobFolder) -> Path:
     return job.path / "worker.json"
 
 
-def _forget_pid(job: JobFolder) -> None:
+def _forget_pid(job: walk.JobFolder) -> None:
     with suppress(OSError):
         _pid_path(job).unlink(missing_ok=True)
 
 
-def _is_worker(pid: int, job: JobFolder) -> bool:
+def _is_worker(pid: int, job: walk.JobFolder) -> bool:
     """Whether a process is the worker of a job: numbers of processes are used again."""
     try:
         arguments = Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")
@@ -263,7 +262,7 @@ def _is_only_cloud(entry: _Entry) -> bool:
     return state.stage == "done" and _has_cloud(state) and state.photos >= len(entry.job.photos())
 
 
-def _has_cloud(state: WalkState) -> bool:
+def _has_cloud(state: walk.WalkState) -> bool:
     """Whether the cloud of a measured job is still to be made."""
     return state.cloud in ("waiting", "running")
 
@@ -273,7 +272,7 @@ def _urgency(entry: _Entry) -> tuple[bool, bool, float]:
     return _is_only_cloud(entry), not entry.job.is_ended, -entry.asked_s
 
 
-def _has_work(job: JobFolder, recent: float) -> bool:
+def _has_work(job: walk.JobFolder, recent: float) -> bool:
     """Whether a job of an earlier run is to be continued; a walk that was left open only if it is recent."""
     state = job.state()
     if not job.photos():

@@ -105,7 +105,7 @@ class Gate:
         access: what a request must present.
         rate: limit on requests with the token, by address.
         connections: the open connections, which are told who has shown the token.
-        stranger_rate: limit on requests without the token, by address; they cannot use up the other one.
+        unauthenticated_rate: limit on requests without the token, by address; they cannot use up the other one.
     """
 
     def __init__(
@@ -114,10 +114,10 @@ class Gate:
         access: Access,
         rate: RateLimit,
         connections: ConnectionTable | None = None,
-        stranger_rate: RateLimit | None = None,
+        unauthenticated_rate: RateLimit | None = None,
     ) -> None:
         self._app, self._access, self._rate = app, access, rate
-        self._connections, self._stranger_rate = connections, stranger_rate or rate
+        self._connections, self._unauthenticated_rate = connections, unauthenticated_rate or rate
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Serve or refuse a request."""
@@ -145,7 +145,7 @@ class Gate:
                 self._check_host(headers)
                 cookie += await self._check_token(scope, headers)
             except Refusal:
-                self._stranger_rate.check(str(address))
+                self._unauthenticated_rate.check(str(address))
                 raise
             self._rate.check(str(address))
             if self._connections is not None:

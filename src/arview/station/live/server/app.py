@@ -85,8 +85,8 @@ def make_app(hub: Hub, access: Access, connections: ConnectionTable | None = Non
     ]
     handlers_of_errors = {**refusal_handlers(), HTTPException: _http_error, StuckError: _stuck}
     app = Starlette(routes=routes, exception_handlers=handlers_of_errors)
-    strangers = RateLimit(limits.strangers_per_s, limits.strangers_burst)
-    return Gate(app, access, RateLimit(limits.per_s, limits.burst), connections, strangers)
+    unauthenticated = RateLimit(limits.unauthenticated_per_s, limits.unauthenticated_burst)
+    return Gate(app, access, RateLimit(limits.per_s, limits.burst), connections, unauthenticated)
 
 
 class Handlers:

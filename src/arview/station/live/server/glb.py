@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from arview.cad.model import Model
+from arview.cad import Model
 from arview.guideviews.mesh_edges import mesh_edges
 
 

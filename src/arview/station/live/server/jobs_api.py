@@ -14,18 +14,9 @@ from starlette.responses import FileResponse, JSONResponse, Response
 from starlette.routing import Route
 
 from arview.errors import InputError, OutputError
-from arview.quality.decisions import (
-    Decision,
-    decide_component,
-    decision_document,
-    decisions_csv,
-    is_attachment,
-    log_of,
-    sign_inspection,
-    tick_step,
-)
-from arview.quality.decisions.folder import photo_path
+from arview.quality import decisions as quality
 from arview.quality.rework import drawing_svg
+from arview.station import walk
 from arview.station.live.jobs.desk import JobDesk
 from arview.station.live.jobs.documents import job_document, job_row, rework
 from arview.station.live.jobs.records import tell_report_and_history
@@ -36,8 +27,6 @@ from arview.station.live.server.hub import Hub
 from arview.station.live.stream.documents import Document, camera_document
 from arview.station.live.stream.feed import TrackedFrame
 from arview.station.live.stream.frames import to_jpeg
-from arview.station.walk.job import JobFolder
-from arview.station.walk.records import PhotoOrigin
 
 BODY_TIMEOUT_S = 10.0
 """Time in which a body must arrive."""
@@ -95,7 +84,7 @@ class JobHandlers:
             Route(f"{job}/sign", self.sign, methods=["POST"]),
             Route(f"{job}/report.html", self.report),
             Route(f"{job}/inspection.json", self.inspection),
-            Route(f"{job}/decisions.csv", self.decisions),
+            Route(f"{job}/quality.csv", self.decisions),
             Route(f"{job}/photos/{{name:path}}", self.photo),
             Route(f"{job}/rework/{{component}}.svg", self.drawing),
             Route(f"{job}/rework/{{picture:path}}", self.picture),
@@ -178,7 +167,7 @@ class JobHandlers:
         answer = await asyncio.to_thread(self._desk.board.uploads(job).state, name)
         if isinstance(answer, Upload):
             return JSONResponse({"offset": answer.offset})
-        if is_attachment(answer):
+        if quality.is_attachment(answer):
             path = await asyncio.to_thread(_photo_file, job, answer)
             return JSONResponse({"photo": answer, "offset": 0 if path is None else path.stat().st_size})
         photos = await asyncio.to_thread(job.photos)
@@ -202,7 +191,7 @@ class JobHandlers:
             if refusal.status == 422 and is_measured:
                 await asyncio.to_thread(self._desk.lost, job)
             raise
-        if isinstance(answer, str) and not is_attachment(answer):
+        if isinstance(answer, str) and not quality.is_attachment(answer):
             await asyncio.to_thread(self._desk.changed, job)
         return _upload_response(answer)
 
@@ -219,7 +208,7 @@ class JobHandlers:
             raise Refusal(409, "other_job", "this page shows another inspection")
         if tracked is None:
             raise Refusal(409, "no_such_frame", "there is no picture yet")
-        source: PhotoOrigin = "station" if client.feed.kind == "station" else "stream"
+        source: walk.PhotoOrigin = "station" if client.feed.kind == "station" else "stream"
         hint = _hint(tracked, binding.view.number)
 
         def store() -> str:
@@ -252,7 +241,8 @@ class JobHandlers:
         one = {"component": "", "is_ok": None, "photo": None} | await self._json(request)
         reason, note, by = (one.get(key) or "" for key in ("reason", "note", "by"))
         return await self._kept(
-            job, lambda: decide_component(job.path, one["component"], one["is_ok"], reason, note, by, one["photo"])
+            job,
+            lambda: quality.decide_component(job.path, one["component"], one["is_ok"], reason, note, by, one["photo"]),
         )
 
     async def tick(self, request: Request) -> Response:
@@ -260,21 +250,26 @@ class JobHandlers:
         job = await self._measured(request)
         one = {"component": "", "step": None, "is_done": None} | await self._json(request)
         return await self._kept(
-            job, lambda: tick_step(job.path, one["component"], one["step"], one["is_done"], one.get("by") or "")
+            job,
+            lambda: quality.tick_step(job.path, one["component"], one["step"], one["is_done"], one.get("by") or ""),
         )
 
     async def sign(self, request: Request) -> Response:
         """Keep a signature."""
         job = await self._measured(request)
         one = await self._json(request)
-        return await self._kept(job, lambda: sign_inspection(job.path, one.get("by") or "", one.get("note") or ""))
+        return await self._kept(
+            job, lambda: quality.sign_inspection(job.path, one.get("by") or "", one.get("note") or "")
+        )
 
     async def decisions(self, request: Request) -> Response:
         """The decisions as CSV."""
         job = await self._job(request)
 
         def table() -> str:
-            return decisions_csv(log_of(job.path).content().entries, str(job.document["part_name"]), job.serial)
+            return quality.decisions_csv(
+                quality.log_of(job.path).content().entries, str(job.document["part_name"]), job.serial
+            )
 
         headers = {"Content-Disposition": f'attachment; filename="decisions_{job.id}.csv"'}
         return Response(await self._stored(table), media_type="text/csv; charset=utf-8", headers=headers)
@@ -319,7 +314,7 @@ class JobHandlers:
             raise Refusal(404, "not_found", "there is no such picture")
         return FileResponse(path, media_type=media_type)
 
-    def _file(self, job: JobFolder, name: str, media_type: str, headers: dict[str, str] | None = None) -> Response:
+    def _file(self, job: walk.JobFolder, name: str, media_type: str, headers: dict[str, str] | None = None) -> Response:
         path = job.path / name
         if not path.is_file():
             raise Refusal(404, "not_found", "this part is not measured yet")
@@ -327,11 +322,11 @@ class JobHandlers:
 
     # --- internals ---------------------------------------------------------------------------------------
 
-    async def _job(self, request: Request) -> JobFolder:
+    async def _job(self, request: Request) -> walk.JobFolder:
         self._hub.ready()
         return await asyncio.to_thread(self._desk.board.find, request.path_params["job"])
 
-    async def _measured(self, request: Request) -> JobFolder:
+    async def _measured(self, request: Request) -> walk.JobFolder:
         """The job, which must be measured."""
         job = await self._job(request)
         is_done = await asyncio.to_thread(
@@ -341,16 +336,16 @@ class JobHandlers:
             raise Refusal(409, "not_done", "this part is not measured yet")
         return job
 
-    async def _document(self, job: JobFolder, status: int = 200) -> Response:
+    async def _document(self, job: walk.JobFolder, status: int = 200) -> Response:
         return JSONResponse(await self._stored(lambda: job_document(job, self._desk)), status)
 
-    async def _kept(self, job: JobFolder, write: Callable[[], Decision]) -> Response:
+    async def _kept(self, job: walk.JobFolder, write: Callable[[], quality.Decision]) -> Response:
         """Add an entry to the log of decisions; it is answered when it is on the disk, then report and store follow."""
         kept = await self._stored(write)
         following = asyncio.ensure_future(asyncio.to_thread(tell_report_and_history, job))
         self._following.add(following)
         following.add_done_callback(self._following.discard)
-        return JSONResponse(decision_document(kept), 201)
+        return JSONResponse(quality.decision_document(kept), 201)
 
     async def _stored(self, work: Callable[[], T]) -> T:
         """Do something with files in a thread; what is wrong becomes an answer."""
@@ -365,15 +360,15 @@ class JobHandlers:
         return await json_body(request, TEXT_BYTES, BODY_TIMEOUT_S)
 
 
-def _photo_file(job: JobFolder, name: str) -> Path | None:
+def _photo_file(job: walk.JobFolder, name: str) -> Path | None:
     """File of a photo of a job, or of the photo of another of its record that a decision names; None without one."""
     if name in {photo.name for photo in job.photos()}:
         return job.path / "photos" / name
-    path = photo_path((job.parent or job).path, name) if "/" in name else None
-    if path is None or is_attachment(name):
+    path = quality.photo_path((job.parent or job).path, name) if "/" in name else None
+    if path is None or quality.is_attachment(name):
         return path if path is not None and path.is_file() else None
     try:
-        owner = JobFolder.open(path.parent.parent)
+        owner = walk.JobFolder.open(path.parent.parent)
     except InputError:
         return None
     return path if path.name in {photo.name for photo in owner.photos()} else None

@@ -11,17 +11,14 @@ from pathlib import Path
 
 import numpy as np
 
+from arview import guideviews, tracking
 from arview.cad import Part, load_part
-from arview.camera.read import guess_camera
-from arview.camera.undistort import require_brown
+from arview.camera import guess_camera, require_brown
 from arview.core.progress import StepProgress
 from arview.errors import ArviewError, InputError, MismatchError
-from arview.guideviews import GuideViewOptions, GuideViewSet, load_guide_views
-from arview.guideviews.cache import cached_guide_views
 from arview.station.live.options import LiveOptions
 from arview.station.live.stream.subject import Subject
 from arview.station.live.stream.subjects import Subjects
-from arview.tracking.several.specimens import specimen_names
 
 logger = logging.getLogger("arview.station.live")
 
@@ -31,7 +28,7 @@ def load_subjects(
     unit: str | None,
     views_path: str | None,
     options: LiveOptions,
-    view_options: GuideViewOptions | None = None,
+    view_options: guideviews.GuideViewOptions | None = None,
     progress: StepProgress | None = None,
     instances: int = 1,
 ) -> Subjects:
@@ -58,16 +55,16 @@ def load_subjects(
             f"{len(inspections)} inspections for {len(parts)} specimen{'s' if len(parts) > 1 else ''}: give one for "
             f"each part, or with several instances one for each specimen"
         )
-    names = specimen_names([part.name for part in parts]) if len(parts) > 1 else [""]
-    views: dict[str, GuideViewSet] = {}
+    names = tracking.specimen_names([part.name for part in parts]) if len(parts) > 1 else [""]
+    views: dict[str, guideviews.GuideViewSet] = {}
 
-    def views_of(part: Part) -> GuideViewSet:
+    def views_of(part: Part) -> guideviews.GuideViewSet:
         model = part.model.source_hash
         if model not in views:
             views[model] = (
-                cached_guide_views(part.model, part.effective_view_range, view_options, progress=progress)
+                guideviews.cached_guide_views(part.model, part.effective_view_range, view_options, progress=progress)
                 if views_path is None
-                else load_guide_views(Path(views_path), part.model)
+                else guideviews.load_guide_views(Path(views_path), part.model)
             )
         return views[model]
 

@@ -5,23 +5,9 @@ from __future__ import annotations
 from datetime import UTC, datetime
 from typing import Any
 
+from arview import overlay
 from arview.camera import Camera
 from arview.inspection import ComponentDeviation, Finding, Inspection
-from arview.overlay.evidence import DrawnEvidence, evidence_of, presence_of
-from arview.overlay.labels import (
-    MEASURING,
-    arrow_scale,
-    detail_text,
-    inspection_doubt,
-    label_order,
-    label_text,
-    value_text,
-)
-from arview.overlay.legend import legend_entries, withheld_title
-from arview.overlay.mesh import anchor_in_model, topology
-from arview.overlay.options import VERDICT_RGB, VERDICT_WORD, OverlayOptions
-from arview.overlay.several import specimen_mark, specimen_rgb
-from arview.overlay.status import completeness_text
 from arview.pose import Pose
 from arview.station.live.options import LiveOptions
 from arview.station.live.protocol import PROTOCOL
@@ -83,23 +69,23 @@ def evidence_document(pose: Pose, subject: Subject | None) -> Document:
         return document
     components, inspection, options = subject.part.model.components, subject.inspection, subject.label_options
     if len(components) > 1:
-        document["completeness"] = completeness_text(pose)
+        document["completeness"] = overlay.completeness_text(pose)
     if pose.is_label_withheld:
-        document["withheld"] = {"title": withheld_title(pose), "text": pose.identity_reason}
-        document["legend"] = _legend([DrawnEvidence.WITHHELD])
+        document["withheld"] = {"title": overlay.withheld_title(pose), "text": pose.identity_reason}
+        document["legend"] = _legend([overlay.DrawnEvidence.WITHHELD])
         return document
-    doubt = inspection_doubt(inspection, subject.serial, options) if inspection else ""
+    doubt = overlay.inspection_doubt(inspection, subject.serial, options) if inspection else ""
     found = {one.name: one for one in inspection.components} if inspection else {}
     shown = []
     for index, component in enumerate(components):
-        presence, deviation = presence_of(pose, component.name, len(components)), found.get(component.name)
-        evidence = evidence_of(presence)
+        presence, deviation = overlay.presence_of(pose, component.name, len(components)), found.get(component.name)
+        evidence = overlay.evidence_of(presence)
         shown.append(evidence)
         is_back = deviation is not None and deviation.finding is Finding.MISSING and presence is not None
-        if evidence is DrawnEvidence.SEEN and not is_back and not (doubt and deviation is not None):
+        if evidence is overlay.DrawnEvidence.SEEN and not is_back and not (doubt and deviation is not None):
             continue
         center = component.bounds_in_model.mean(axis=0)
-        text = label_text(
+        text = overlay.label_text(
             component.name,
             deviation,
             presence,
@@ -126,8 +112,8 @@ def evidence_document(pose: Pose, subject: Subject | None) -> Document:
     return document
 
 
-def _legend(evidence: list[DrawnEvidence]) -> list[Document]:
-    return [{"kind": str(kind), "text": text} for kind, text in legend_entries(evidence)]
+def _legend(evidence: list[overlay.DrawnEvidence]) -> list[Document]:
+    return [{"kind": str(kind), "text": text} for kind, text in overlay.legend_entries(evidence)]
 
 
 def camera_document(camera: Camera) -> Document:
@@ -164,7 +150,7 @@ def parts_document(subjects: Subjects) -> Document:
     """*Part*: the parts, their components and their measured deviations."""
     parts = [part_document(subject) for subject in subjects]
     names = [
-        {"name": one.name, "mark": specimen_mark(number), "tag_color": _hex(specimen_rgb(number))}
+        {"name": one.name, "mark": overlay.specimen_mark(number), "tag_color": _hex(overlay.specimen_rgb(number))}
         for number, one in enumerate(subjects)
     ]
     return {
@@ -191,7 +177,7 @@ def with_ages(document: Document, subjects: Subjects) -> Document:
 def part_document(subject: Subject) -> Document:
     """What *Part* says of one part."""
     model, inspection = subject.part.model, subject.inspection
-    order = label_order([one.name for one in model.components], inspection, subject.pending)
+    order = overlay.label_order([one.name for one in model.components], inspection, subject.pending)
     ranks = {name: rank for rank, name in enumerate(order)}
     components = []
     for component in model.components:
@@ -200,7 +186,7 @@ def part_document(subject: Subject) -> Document:
             {
                 "name": component.name,
                 "color": _hex(tuple(round(255 * value) for value in component.color)),
-                "anchor_in_model": anchor_in_model(component, topology(component)).tolist(),
+                "anchor_in_model": overlay.anchor_in_model(component, overlay.topology(component)).tolist(),
                 "rank": ranks.get(component.name),
                 **_deviation_document(found, component.name in subject.pending),
             }
@@ -216,7 +202,9 @@ def part_document(subject: Subject) -> Document:
         },
         "components": components,
         "inspection": _inspection_document(inspection),
-        "arrow_scale": arrow_scale(inspection, model.diameter_mm, OverlayOptions()) if inspection else 1.0,
+        "arrow_scale": overlay.arrow_scale(inspection, model.diameter_mm, overlay.OverlayOptions())
+        if inspection
+        else 1.0,
     }
 
 
@@ -260,20 +248,20 @@ def style_document(style: OverlayStyle) -> Document:
 def _deviation_document(found: ComponentDeviation | None, is_pending: bool = False) -> Document:
     if found is None:
         names = ("verdict", "verdict_text", "verdict_color", "distance_mm", "uncertainty_mm", "tolerance_mm")
-        value = MEASURING if is_pending else ""
+        value = overlay.MEASURING if is_pending else ""
         empty = {"displacement_mm": None, "missing": False, "value_text": value, "detail_text": ""}
         return {**dict.fromkeys(names), **empty, "is_pending": is_pending}
     return {
         "verdict": str(found.verdict),
-        "verdict_text": VERDICT_WORD[found.verdict],
-        "verdict_color": _hex(VERDICT_RGB[found.verdict]),
+        "verdict_text": overlay.VERDICT_WORD[found.verdict],
+        "verdict_color": _hex(overlay.VERDICT_RGB[found.verdict]),
         "distance_mm": found.distance_mm,
         "uncertainty_mm": found.uncertainty_mm,
         "tolerance_mm": found.tolerance_mm,
         "displacement_mm": list(found.displacement_mm),
         "missing": found.finding is Finding.MISSING,
-        "value_text": value_text(found),
-        "detail_text": detail_text(found),
+        "value_text": overlay.value_text(found),
+        "detail_text": overlay.detail_text(found),
         "is_pending": False,
     }
 

@@ -12,9 +12,8 @@ from functools import cached_property
 
 import numpy as np
 
-from arview.camera import Camera
-from arview.camera.read import guess_camera
-from arview.camera.undistort import FrameView, require_brown
+from arview import tracking
+from arview.camera import Camera, FrameView, guess_camera, require_brown
 from arview.errors import ArviewError
 from arview.pose import Pose, TrackingState
 from arview.station.live.options import UNDISTORT
@@ -23,7 +22,6 @@ from arview.station.live.stream.newest import NewestSlot
 from arview.station.live.stream.notices import Notice, without_folder
 from arview.station.live.stream.sessions import FeedSession
 from arview.station.live.stream.subjects import Subjects
-from arview.tracking.self_calibration.profile import keep_profile
 
 STUCK_S = 90.0
 """A frame that is tracked for longer is given up with its thread; compiling takes a minute."""
@@ -233,7 +231,7 @@ class Feed:
         if profile is None or not estimate.is_determined or self._shape is None:
             return
         try:
-            path = keep_profile(estimate, profile, self._subjects.options.source, self._shape[2])
+            path = tracking.keep_profile(estimate, profile, self._subjects.options.source, self._shape[2])
             logger.info("wrote %s; use it with --camera profile:%s", path, profile)
         except ArviewError as error:
             logger.error("%s", error)

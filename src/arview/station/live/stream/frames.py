@@ -10,11 +10,10 @@ import cv2
 import numpy as np
 from av.video.frame import VideoFrame
 
-from arview.camera.exif import check_jpeg_scans
+from arview.camera import check_jpeg_scans
 from arview.errors import InputError
 from arview.station.live.stream.stamp import read_stamp
-from arview.video import Image
-from arview.video.color import rgb_from_video_frame
+from arview.video import Image, rgb_from_video_frame
 
 MIN_SIDE_PX, MAX_SIDE_PX = 64, 2560
 """Range of the sides of the pictures that are accepted."""

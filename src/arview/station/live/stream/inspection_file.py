@@ -5,10 +5,10 @@ from __future__ import annotations
 from datetime import UTC, datetime
 from pathlib import Path
 
-from arview.cad.model import Model
+from arview import overlay
+from arview.cad import Model
 from arview.errors import ArviewError, MismatchError
 from arview.inspection import Inspection, load_inspection
-from arview.overlay.status import age_text
 from arview.station.live.stream.notices import Notice, without_folder
 
 _State = tuple[int, int, int] | None
@@ -92,7 +92,7 @@ def age_notices(inspection: Inspection, max_age_s: float | None, now: datetime |
         text = f"measured in the future, by {_lead_text(-age_s)}: check the clocks of this machine and of the other"
         return [Notice("inspection_future", "warning", text)]
     if max_age_s is not None and age_s > max_age_s:
-        return [Notice("inspection_old", "warning", f"measured {age_text(age_s)}: measure again")]
+        return [Notice("inspection_old", "warning", f"measured {overlay.age_text(age_s)}: measure again")]
     return []
 
 

@@ -24,8 +24,7 @@ from arview.station.live.stream.feed import Feed, TrackedFrame
 from arview.station.live.stream.newest import NewestSlot
 from arview.station.live.stream.notices import Notice
 from arview.station.live.stream.recovery import RECOVERED, duration_s, recover_recordings
-from arview.video import Image, VideoSink
-from arview.video.sinks import CONTAINERS
+from arview.video import CONTAINERS, Image, VideoSink
 
 MIN_FREE_BYTES = 500_000_000
 """Free disk space that is left to other programs."""

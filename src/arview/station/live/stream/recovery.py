@@ -14,7 +14,7 @@ from pathlib import Path
 import av
 
 from arview.core.atomic import replacing, writing_process
-from arview.video.sinks import CONTAINERS
+from arview.video import CONTAINERS
 
 logger = logging.getLogger("arview.station.live")
 

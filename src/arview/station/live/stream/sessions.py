@@ -5,13 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Protocol
 
+from arview import tracking
 from arview.camera import Camera
-from arview.fiducials.serial_code import SerialNumbers
+from arview.fiducials import SerialNumbers
 from arview.pose import Pose
-from arview.tracking import TrackingSession
-from arview.tracking.self_calibration.estimator import FocalEstimate
-from arview.tracking.self_calibration.session import SelfCalibratingSession
-from arview.tracking.several.sessions import SeveralSessions
 from arview.video import Image
 
 
@@ -24,7 +21,7 @@ class FeedSession(Protocol):
         ...
 
     @property
-    def estimate(self) -> FocalEstimate | None:
+    def estimate(self) -> tracking.FocalEstimate | None:
         """The last estimate of a guessed camera; None without one."""
         ...
 
@@ -44,7 +41,7 @@ class FeedSession(Protocol):
         """The user says that the part in view is the one to which its labels belong; None: the only one."""
         ...
 
-    def finish(self) -> FocalEstimate | None:
+    def finish(self) -> tracking.FocalEstimate | None:
         """The estimate of a guessed camera from all frames, after the last one; None where it is not estimated."""
         ...
 
@@ -52,18 +49,18 @@ class FeedSession(Protocol):
 class OnePartSession:
     """One part in one stream; a guessed camera is replaced once its focal length is known."""
 
-    def __init__(self, session: TrackingSession | SelfCalibratingSession) -> None:
+    def __init__(self, session: tracking.TrackingSession | tracking.SelfCalibratingSession) -> None:
         self._session = session
 
     @property
     def camera(self) -> Camera | None:
         """See `FeedSession`."""
-        return self._session.camera if isinstance(self._session, SelfCalibratingSession) else None
+        return self._session.camera if isinstance(self._session, tracking.SelfCalibratingSession) else None
 
     @property
-    def estimate(self) -> FocalEstimate | None:
+    def estimate(self) -> tracking.FocalEstimate | None:
         """See `FeedSession`."""
-        return self._session.estimate if isinstance(self._session, SelfCalibratingSession) else None
+        return self._session.estimate if isinstance(self._session, tracking.SelfCalibratingSession) else None
 
     def process(self, image: Image, index: int, time_s: float) -> tuple[Pose, ...]:
         """See `FeedSession`."""
@@ -81,18 +78,18 @@ class OnePartSession:
         """See `FeedSession`."""
         self._session.confirm()
 
-    def finish(self) -> FocalEstimate | None:
+    def finish(self) -> tracking.FocalEstimate | None:
         """See `FeedSession`."""
-        return self._session.finish() if isinstance(self._session, SelfCalibratingSession) else None
+        return self._session.finish() if isinstance(self._session, tracking.SelfCalibratingSession) else None
 
 
 class SeveralPartsSession:
     """Several parts in one stream, each with a session of its own. A guessed camera is kept."""
 
     camera: Camera | None = None
-    estimate: FocalEstimate | None = None
+    estimate: tracking.FocalEstimate | None = None
 
-    def __init__(self, several: SeveralSessions) -> None:
+    def __init__(self, several: tracking.SeveralSessions) -> None:
         self._several = several
         self._sessions = tuple(several.sessions.values())
 
@@ -115,6 +112,6 @@ class SeveralPartsSession:
         if part is not None:
             self._sessions[part].confirm()
 
-    def finish(self) -> FocalEstimate | None:
+    def finish(self) -> tracking.FocalEstimate | None:
         """See `FeedSession`."""
         return None

@@ -7,21 +7,17 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
-from arview.cad.part import Part
-from arview.camera import Camera
-from arview.camera.read import guess_camera
-from arview.fiducials.serial_code import SerialNumbers
+from arview import guideviews, tracking
+from arview import overlay as overlays
+from arview.cad import Part
+from arview.camera import Camera, guess_camera
+from arview.fiducials import SerialNumbers
 from arview.geometry import Array
-from arview.guideviews import GuideViewSet
 from arview.inspection import Inspection
-from arview.overlay import OverlayOptions, OverlayRenderer
-from arview.overlay.options import EdgeMode
 from arview.station.live.options import LiveOptions
 from arview.station.live.stream.inspection_file import InspectionFile
 from arview.station.live.stream.notices import Notice
-from arview.tracking import TrackingSession
 from arview.tracking.guide_pose import guide_pose
-from arview.tracking.self_calibration.session import SelfCalibratingSession
 
 _SECONDS_PER_DAY = 86400.0
 
@@ -35,9 +31,9 @@ class OverlayStyle:
     """
 
     ghost: bool = True
-    edges: EdgeMode = "visible"
+    edges: overlays.EdgeMode = "visible"
     labels: bool = True
-    opacity: float = OverlayOptions.opacity
+    opacity: float = overlays.OverlayOptions.opacity
     only: str | None = None  # the only component that is drawn and labelled; None: all
     only_part: int = 0  # number of the part to which that component belongs
     status: bool = True  # the status line at the lower edge; the page shows the same as text
@@ -46,9 +42,9 @@ class OverlayStyle:
     def __post_init__(self) -> None:
         self.overlay_options()
 
-    def overlay_options(self) -> OverlayOptions:
+    def overlay_options(self) -> overlays.OverlayOptions:
         """The same style as options of the renderer."""
-        return OverlayOptions(
+        return overlays.OverlayOptions(
             show_ghost=self.ghost,
             show_edges=self.edges,
             show_labels=self.labels,
@@ -82,7 +78,7 @@ class Subject:
     def __init__(
         self,
         part: Part,
-        views: GuideViewSet,
+        views: guideviews.GuideViewSet,
         options: LiveOptions,
         name: str = "",
         inspection_path: Path | None = None,
@@ -101,10 +97,10 @@ class Subject:
     pending: frozenset[str] = frozenset()
 
     @cached_property
-    def label_options(self) -> OverlayOptions:
+    def label_options(self) -> overlays.OverlayOptions:
         """Options of the texts on labels: the units, and from which age on an inspection is stale."""
         max_age_s = self.options.max_age_s
-        return OverlayOptions(max_age_days=None if max_age_s is None else max_age_s / _SECONDS_PER_DAY)
+        return overlays.OverlayOptions(max_age_days=None if max_age_s is None else max_age_s / _SECONDS_PER_DAY)
 
     @property
     def inspection(self) -> Inspection | None:
@@ -133,14 +129,14 @@ class Subject:
             return [Notice("inspection_none", "info", "no inspection: nothing has been measured")]
         return self._file.notices()
 
-    def session(self, camera: Camera) -> TrackingSession | SelfCalibratingSession:
+    def session(self, camera: Camera) -> tracking.TrackingSession | tracking.SelfCalibratingSession:
         """A new tracking session for a feed with this camera, which is replaced while it runs if it is guessed."""
         guide = None
         if self.options.guide is not None:
             guide = guide_pose(self.options.guide, self.part, self.views.view_range, camera)
 
-        def make_session(camera: Camera, start: Array | None) -> TrackingSession:
-            return TrackingSession(
+        def make_session(camera: Camera, start: Array | None) -> tracking.TrackingSession:
+            return tracking.TrackingSession(
                 self.views,
                 camera,
                 self.part.model,
@@ -151,13 +147,13 @@ class Subject:
 
         if self.options.camera is not None:
             return make_session(camera, None)
-        return SelfCalibratingSession(make_session, self.views, camera)
+        return tracking.SelfCalibratingSession(make_session, self.views, camera)
 
-    def session_beside(self, camera: Camera, like: TrackingSession | None) -> TrackingSession:
+    def session_beside(self, camera: Camera, like: tracking.TrackingSession | None) -> tracking.TrackingSession:
         """A session among others of the same stream, which shares the detector of one of the same part if given."""
-        return TrackingSession(self.views, camera, self.part.model, like=like, serials=self.serial_numbers)
+        return tracking.TrackingSession(self.views, camera, self.part.model, like=like, serials=self.serial_numbers)
 
-    def overlay(self, camera: Camera, style: OverlayStyle, number: int = 0) -> OverlayRenderer:
+    def overlay(self, camera: Camera, style: OverlayStyle, number: int = 0) -> overlays.OverlayRenderer:
         """A renderer of the overlay for a feed with this camera; ``number`` is that of this part."""
         with self._lock:
             pending = self.pending
@@ -171,4 +167,6 @@ class Subject:
                 wanted = tuple(one for one in inspection.components if is_of_it and one.name == style.only)
                 inspection = replace(inspection, components=wanted)
         options = replace(style.overlay_options(), max_age_days=self.label_options.max_age_days)
-        return OverlayRenderer(self.part.model, camera, inspection, options, serial=self.serial, pending=pending)
+        return overlays.OverlayRenderer(
+            self.part.model, camera, inspection, options, serial=self.serial, pending=pending
+        )

@@ -6,20 +6,16 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Protocol
 
-from arview.camera import Camera
-from arview.camera.read import guess_camera, load_camera
-from arview.fiducials.serial_code import SerialNumbers
-from arview.overlay import OverlayRenderer
-from arview.overlay.several import SeveralOverlay
+from arview import overlay as overlays
+from arview import tracking
+from arview.camera import Camera, guess_camera, load_camera
+from arview.fiducials import SerialNumbers
 from arview.pose import Pose
 from arview.station.live.options import LiveOptions
 from arview.station.live.stream.notices import Notice
 from arview.station.live.stream.sessions import FeedSession, OnePartSession, SeveralPartsSession
 from arview.station.live.stream.subject import OverlayStyle, Subject
-from arview.tracking import TrackingSession
-from arview.tracking.several.sessions import SeveralSessions
-from arview.video import Image
-from arview.video.intrinsics import load_square_camera
+from arview.video import Image, load_square_camera
 
 PHONE_FOV = "fov:66"
 """Camera assumed for phones: field of view along the longer side. Their main cameras have 65 to 72° (24 to 28 mm)."""
@@ -38,7 +34,7 @@ class FrameOverlay(Protocol):
 class _OnePartOverlay:
     """Draws the only part."""
 
-    def __init__(self, renderer: OverlayRenderer) -> None:
+    def __init__(self, renderer: overlays.OverlayRenderer) -> None:
         self._renderer = renderer
 
     def draw(self, image: Image, poses: tuple[Pose, ...]) -> Image:
@@ -120,18 +116,18 @@ class Subjects:
         """The tracking of all parts for a feed with this camera."""
         if len(self._parts) == 1:
             return OnePartSession(self._parts[0].session(camera))
-        first: dict[str, TrackingSession] = {}
+        first: dict[str, tracking.TrackingSession] = {}
         sessions = {}
         for one in self._parts:
             model = one.part.model.source_hash
             session = one.session_beside(camera, first.get(model))
             sessions[one.name] = session
             first.setdefault(model, session)
-        return SeveralPartsSession(SeveralSessions(sessions))
+        return SeveralPartsSession(tracking.SeveralSessions(sessions))
 
     def overlay(self, camera: Camera, style: OverlayStyle) -> FrameOverlay:
         """The drawing of all parts for a feed with this camera."""
         renderers = {one.name: one.overlay(camera, style, number) for number, one in enumerate(self._parts)}
         if len(self._parts) == 1:
             return _OnePartOverlay(next(iter(renderers.values())))
-        return SeveralOverlay(renderers)
+        return overlays.SeveralOverlay(renderers)
