@@ -14,8 +14,8 @@ import pytest
 from click.testing import CliRunner
 
 from arview.cli import ExitCode, main
-from arview.cli.common import Command, Group
-from arview.cli.exit_codes import help_rows
+from arview.cli.common import SECTIONS, Command, Group
+from arview.cli.exit_codes import group_rows, help_rows
 
 ROOT = Path(__file__).parents[2]
 DOCUMENTS = ("README.md", *(str(path.relative_to(ROOT)) for path in sorted((ROOT / "docs").glob("*.md"))))
@@ -86,13 +86,9 @@ def test_every_help_ends_with_its_exit_codes() -> None:
     for path, command in commands():
         text = " ".join(help_text(path).split())
         assert isinstance(command, Command | Group), path
-        rows = (
-            help_rows(command.exit_codes)
-            if isinstance(command, Command)
-            else [(str(int(code)), code.meaning) for code in ExitCode]
-        )
+        rows = help_rows(command.exit_codes) if isinstance(command, Command) else group_rows()
         assert "Exit codes: " + " ".join(" ".join(row) for row in rows) in text, path
-        assert {"0", "64", "70", "130"} <= {code for code, _ in rows}
+        assert {"0", "64", "70", "130"} <= {code for codes, _ in rows for code in codes.split(", ")}
         seen += 1
     assert seen > 20
 
@@ -103,17 +99,31 @@ def test_the_documents_have_the_same_table() -> None:
         assert f"| {int(code)} | {code.meaning} |" in text, code
 
 
+def test_no_help_is_an_essay() -> None:
+    lengths = {path: len(help_text(path).splitlines()) for path, _ in commands()}
+    assert len(lengths) > 30
+    assert {path: lines for path, lines in lengths.items() if lines > 45} == {}
+
+
+def test_the_program_lists_its_commands_in_sections() -> None:
+    text = help_text(())
+    places = [text.index(f"\n{title}:\n") for title in (*SECTIONS, "More")]
+    assert places == sorted(places)
+    for title, names in SECTIONS.items():
+        section = text.split(f"\n{title}:\n")[1].split("\n\n")[0]
+        assert [line.split()[0] for line in section.splitlines()] == list(names)
+
+
 def test_lines_of_help_fit_a_terminal() -> None:
     for path, _ in commands():
         for line in help_text(path).splitlines():
             assert len(line) <= 120, (path, line)
 
 
-def test_batch_help_shows_its_file_as_it_must_be_written() -> None:
-    text = help_text(("batch",))
-    lines = [line.strip() for line in text.splitlines()]
-    start = lines.index("A file JOBS.toml:")
-    assert lines[start + 1].startswith('out = "results"') and lines[start + 2].startswith("[defaults]")
+def test_notes_show_the_file_of_a_batch_as_it_must_be_written() -> None:
+    lines = (ROOT / "docs" / "reference" / "command-notes.md").read_text(encoding="utf-8").splitlines()
+    start = lines.index("A file JOBS.toml:") + 3
+    assert lines[start].startswith('out = "results"') and lines[start + 1].startswith("[defaults]")
 
 
 def test_shell_completion() -> None:
@@ -125,7 +135,8 @@ def test_shell_completion() -> None:
     words = {"COMP_WORDS": "arview ann", "COMP_CWORD": "1", "_ARVIEW_COMPLETE": "bash_complete"}
     done = subprocess.run(program, capture_output=True, text=True, env={**words, **environment()}, timeout=60)
     assert done.stdout.split() == ["plain,annotate"], done.stderr
-    assert "_ARVIEW_COMPLETE=bash_source arview" in help_text(())
+    notes = (ROOT / "docs" / "reference" / "command-notes.md").read_text(encoding="utf-8")
+    assert "_ARVIEW_COMPLETE=bash_source arview" in notes
 
 
 def environment() -> dict[str, str]:

@@ -103,7 +103,7 @@ def test_a_part_is_checked_found_and_annotated_without_extras(tmp_path: Path) ->
     checked, annotated, listed, exported = run_bare(
         ["check", PART],
         [*annotate, "--end", "12", "-o", str(film)],
-        ["decisions", INSPECTION],
+        ["decisions", "list", INSPECTION],
         ["export", INSPECTION, "--to", "csv", "-o", str(tmp_path / "out.csv")],
     )
     assert checked[0] == 0 and "11 components" in checked[1], checked

@@ -122,67 +122,8 @@ def _keep_named_part(ctx: click.Context, parameter: click.Parameter, value: str 
 Examples:
   arview annotate clip.mp4 --part part.toml --camera camera.json --inspection inspection.json -o out.mp4
   arview annotate clip.mov --part housing.step --camera fov:65 --poses poses.jsonl
-  arview annotate "shots/*.jpg" --part part.toml --camera exif --start 10 --end 200
-  arview annotate rtsp://camera.local/1 --part part.toml --camera camera.json -o live.mp4
   arview annotate 0 --part part.toml --camera fov:65 --init guide:iso -o live.mp4
-  arview annotate 0 --part part.toml --camera fov:65 --learned bracket.learned -o live.mp4
-  arview annotate clip.mp4 --part part.toml --camera camera.json --poses poses.jsonl --check-presence
-  arview annotate bench.mp4 --part a.toml --part b.toml --inspection a.json --inspection b.json -o out.mp4
-  arview annotate bench.mp4 --part part.toml --instances 2 --camera camera.json -o out.mp4
-
-\b
-Frames. Seconds of --start and --end, and times in the poses file, count from the first frame of SOURCE. Where the
-names of pictures differ in one number only, that is their frame number, so that gaps stay gaps. Pixels are made
-square and interlaced film is deinterlaced; a camera file may be made for the frames before or after.
-
-\b
-Where tracking starts. Without --init the part is detected. --init POSE.json, {"cam_from_model": 4x4},
-starts near that pose. --init guide:NAME draws the outline of a guide view over the video, and tracking
-starts when the part is brought within about 15 degrees and 15 % of it. NAME is a view of the part file
-([guides.NAME]), or one of these as far as the declared range has them: front (camera at -Y), back (+Y),
-left (-X), right (+X), top (+Z), bottom (-Z), iso (front, right and above), middle (of the range); or a
-direction like az45_el30, with _d650 for the distance in mm and _r10 for the roll.
-
-\b
-While the part is tracked well, up to 48 small images of it from different sides are kept in memory;
-after a loss, every frame is first searched by them. --learned FILE reads such images from an earlier run
-(if the file exists) and writes all of them to it at the end, so that the next run under the same light
-finds the part sooner. They only suggest where to search: what is found must still fit the CAD.
-
-\b
-Which of several equal parts the inspection belongs to. Labels stay with the part that was tracked first. After a
-loss, or a jump, arview compares the place of what it finds with the scene: if it may be another part of the same
-kind, labels are withheld until the first one is seen again. --serial-at FRAME:X,Y names the part at pixel X,Y of
-frame FRAME (numbers as in the poses file): labels are withheld until then and belong to that part from then on. A
-DataMatrix or QR code (or AprilTag) on the part that holds the serial number of the inspection confirms the part; one
-that holds another serial number withholds the labels. See serial_pattern in the part file.
-
-\b
-CAMERA is a file (arview or BOP JSON, OpenCV YAML/XML/JSON, ROS camera_info, Kalibr camchain, COLMAP cameras.txt,
-Metashape XML, RealSense JSON, nerfstudio transforms.json; FILE:NAME for one of several cameras in it, like
-rig.yaml:cam0), fov:DEG (field of view along the longer side), exif, or profile:NAME (stored by
-`arview calibrate --profile`; profile alone takes the one that matches what the source says of its camera).
-Without it the focal length is guessed, and estimated from the frames in which the part is tracked: of a film in
-a first pass, of a camera or stream while it runs. --save-profile NAME keeps the estimate for --camera
-profile:NAME. Views from far away, or always from the same side, do not tell the focal length; then the guess is
-kept.
-
-\b
-Several at once. --part may be given again, and --instances N tracks N specimens of each part. Each has its
-own labels, status line and lines in the poses file, told apart by "instance": the part's name, with #1, #2
-where several have the same. Inspections belong to the specimens in their order.
-
-\b
-Components. Each is present, missing, displaced, uncertain or unverified by what the frames have shown so far,
-whatever was measured before. --check-presence exits by what is known of all components at the end.
-
-\b
-Each line of a poses file is a JSON object: index, file (of a picture), time_s, state, quality,
-cam_from_model (4x4 row-major, mm), covariance (6x6), ms, reason (why the part is not tracked), mismatches,
-unverified (components that have not been verified yet), alternatives (poses that fit as well), presence (of
-each component) and presence_details, completeness, identity (followed, confirmed, unconfirmed or other) and
-identity_reason, serial (read from a code), instance, and camera where none was given.
-Ctrl-C ends the run and finishes the files.""",
+  Notes: docs/reference/command-notes.md""",
 )
 @click.argument("source")
 @click.option(
@@ -195,27 +136,25 @@ Ctrl-C ends the run and finishes the files.""",
 )
 @click.option("--instances", type=click.IntRange(1, 16), default=1, metavar="N", help="Specimens of each part in view.")
 @click.option("--guideviews", "views_path", metavar="SET", help="Guide views; default: rendered and cached.")
-@click.option("--camera", "camera_spec", metavar="CAMERA", help="See below; without it the camera is guessed.")
-@click.option("--save-profile", "profile", metavar="NAME", help="Keep the estimated camera as a profile; see below.")
+@click.option("--camera", "camera_spec", metavar="CAMERA", help="Camera file, fov:DEG or exif; default: guessed.")
+@click.option("--save-profile", "profile", metavar="NAME", help="Keep the estimated camera as a profile.")
 @click.option(
     "--inspection",
     "inspection_paths",
     multiple=True,
     metavar="FILE",
-    help="inspection.json whose values are drawn; again for further specimens, in their order.",
+    help="inspection.json to draw; again for further specimens.",
 )
 @click.option("-o", "--output", metavar="OUT.mp4", help="Annotated video.")
 @click.option("--poses", "poses_path", metavar="OUT.jsonl", help="Pose of every frame.")
-@click.option("--init", metavar="WHERE", help="Pose of the first frame, or guide:NAME to align with; see below.")
-@click.option(
-    "--learned", "learned_path", metavar="FILE", help="Learned views: read if the file exists, written at the end."
-)
+@click.option("--init", metavar="WHERE", help="POSE.json, or guide:NAME to align with.")
+@click.option("--learned", "learned_path", metavar="FILE", help="Learned views, read and written.")
 @click.option(
     "--serial-at",
     expose_value=False,
     callback=_keep_named_part,
     metavar="FRAME:X,Y",
-    help="Frame and pixel of the part that the inspection belongs to; see below.",
+    help="The part that the inspection belongs to.",
 )
 @click.option("--start", callback=_parse_moment, metavar="S", help="First frame: number, or seconds like 2.5s.")
 @click.option("--end", callback=_parse_moment, metavar="S", help="Frame to stop at: number, or seconds like 8s.")
@@ -223,10 +162,11 @@ Ctrl-C ends the run and finishes the files.""",
 @click.option("--fps", type=float, default=30.0, show_default=True, help="Frame rate of a folder or glob of pictures.")
 @click.option(
     "--show-edges",
+    metavar="WHICH",
     type=click.Choice(["none", "visible", "all"]),
     default="visible",
     show_default=True,
-    help="CAD edges to draw.",
+    help="CAD edges to draw: none, visible or all.",
 )
 @click.option("--no-ghost", is_flag=True, help="Leave out the translucent components.")
 @click.option("--no-labels", is_flag=True, help="Leave out the labels.")
@@ -244,7 +184,7 @@ Ctrl-C ends the run and finishes the files.""",
     callback=_keep_for_drawing,
     help="Leave out the legend of components that are not as measured.",
 )
-@click.option("--check-presence", is_flag=True, help="Exit by whether all components were seen in place; see below.")
+@click.option("--check-presence", is_flag=True, help="Exit by whether all components were seen in place.")
 @click.option("--opacity", type=click.FloatRange(0.0, 1.0), help="Opacity of the translucent components, 0 to 1.")
 @MODALITY
 @RENDERER
@@ -276,11 +216,7 @@ def annotate(
     renderer: str,
     unit: str | None,
 ) -> None:
-    """Find and track the part in SOURCE, and write the annotated video and/or the poses.
-
-    SOURCE is a video file, a picture, a folder, glob or pattern (frame_%04d.png) of pictures, a camera number or an
-    RTSP/HTTP address.
-    """
+    """Track the part in SOURCE (video, pictures, camera number, RTSP/HTTP address); write video and poses."""
     from arview.video import VideoSink, open_source
 
     check_profile(profile, camera_spec)

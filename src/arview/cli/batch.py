@@ -25,38 +25,7 @@ Examples:
   arview batch jobs.toml
   arview batch jobs.toml --workers 4 --memory-limit 3GB --store plate.sqlite
   arview batch jobs.toml --scheduler tcp://10.0.0.5:8786
-
-\b
-A file JOBS.toml:
-  out = "results"                # a folder or URL; each job has a folder in it
-  [defaults]                     # for jobs that do not say otherwise
-  part = "part.toml"
-  tolerance_mm = 0.5             # or any other field of a job
-  [[job]]
-  serial = "PL-0417"             # also the name of its folder, unless there is a name
-  photos = "photos/PL-0417"
-  [[job]]
-  name = "PL-0418_again"
-  serial = "PL-0418"
-  photos = "s3://plates/PL-0418"
-  video = "films/PL-0418.mp4"
-  # camera, video_camera, scale_file, masks, sparse, unit, guard, max_frames, seed, threads, device,
-  # makes_pdf, compares_halves
-
-\b
-Paths are relative to JOBS.toml, or URLs that fsspec knows (s3, gs, abfs, sftp, http; some need a package,
-which is then named). With a URL as out, results are sent when they are complete. A job is identified by
-the content of its inputs, and a finished one is not repeated: run an interrupted batch again to resume
-it, or add jobs to the file.
-
-\b
-A worker does one job at a time. A job whose worker dies is given to another one; a job that fails for
-lack of storage or memory is tried again; a job that cannot be done does not stop the others. The workers
-of a cluster need arview, the same paths or URLs, and one thread:
-  dask worker tcp://10.0.0.5:8786 --nthreads 1 --memory-limit 4GB
-
-\b
-The exit code is the worst result of all jobs, in the order 3, 1, 2, 0.""",
+  Notes: docs/reference/command-notes.md""",
     exit_codes={
         ExitCode.DONE: "all jobs pass",
         ExitCode.FAIL: "a job fails",

@@ -52,27 +52,7 @@ Examples:
   arview capture 0 --part part.toml --camera station.json -o photos/ --serial PL-0417
   arview capture rtsp://camera.local/1 --part part.toml --camera station.json -o photos/ --count 12
   arview capture "frames/*.png" --fps 24 --part part.toml --camera phone.json -o photos/
-
-\b
-The part is tracked through SOURCE, and a frame becomes a photo when it is taken from a new direction that
-lowers the uncertainty U to be expected of the components, when the part is tracked well, is at a good
-distance and wholly in the picture, and when the frame is sharp. It ends when 20 photos (or --count) are
-taken and every component is seen in 4 of them from 3 directions with a U below a quarter of its tolerance;
-where a component lacks photos, up to 40 are taken. With a camera, it is printed where to go next. A part
-on a turntable, or a camera on an arm, works the same way: what counts is the pose of the part.
-
-\b
-FOLDER is new or empty and gets
-  photos/0001.jpg …  frames in full size; of a folder of pictures, the files themselves with their EXIF data
-  photos.jsonl       a line for each photo: name, SHA-256, time, tracked pose; the last line is the end
-  camera.json        the camera, where --camera was given: use it for `arview inspect --camera`
-  job.json           with --serial: the folder is then a job like those of the live page
-Each photo is complete on the disk before the next one is looked for.
-
-\b
-The direction of a photo is that of the camera as seen from the middle of the part, within the range of
-views of the part file. Expected U: k = 2, along the worst axis, for pixels of these frames.
-CAMERA is as in `arview annotate --help`; without it the focal length is estimated first.""",
+  Notes: docs/reference/command-notes.md""",
 )
 @click.argument("source")
 @click.option("--part", "part_path", required=True, metavar="PART", help="Part file or CAD file.")

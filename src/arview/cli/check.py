@@ -4,24 +4,19 @@ from __future__ import annotations
 
 import click
 
-from arview import guideviews
-from arview.cli.common import UNIT, Command, main
+from arview import cad, guideviews
+from arview.cli.common import UNIT, main
 from arview.errors import InputError
 
 
-class _CheckCommand(Command):
-    """Its help ends with a complete part file."""
-
-    def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Write the epilog, then the part file."""
-        from arview.cad import PART_FILE_EXAMPLE
-
-        super().format_epilog(ctx, formatter)
-        formatter.write("\nA part file is a TOML file like this one:\n\n" + PART_FILE_EXAMPLE)
+def _show_example(ctx: click.Context, _parameter: click.Parameter, is_wanted: bool) -> None:
+    """Print a part file that has every key, and exit."""
+    if is_wanted:
+        click.echo(cad.PART_FILE_EXAMPLE, nl=False)
+        ctx.exit()
 
 
 @main.command(
-    cls=_CheckCommand,
     short_help="Print what a part consists of, and what will be hard.",
     epilog="""\b
 Examples:
@@ -35,17 +30,24 @@ Examples:
 @click.option(
     "--against", "others", multiple=True, metavar="PART", help="Another part it might be taken for; may be repeated."
 )
+@click.option(
+    "--example",
+    is_flag=True,
+    is_eager=True,
+    expose_value=False,
+    callback=_show_example,
+    help="Print a part file with every key and what it means, and exit.",
+)
 def check(part: str, unit: str | None, camera_spec: str | None, others: tuple[str, ...]) -> None:
     """Print what PART consists of, and what will be hard about finding and tracking it.
 
     Symmetric or ambiguous shapes, components too small to be seen from the declared distance, thin or open
     geometry. Findings are not errors: the exit code is 0.
     """
-    from arview.cad import check_part, load_part
     from arview.camera import load_camera
 
-    loaded = load_part(part, unit)
-    beside = [load_part(other, unit) for other in others]
+    loaded = cad.load_part(part, unit)
+    beside = [cad.load_part(other, unit) for other in others]
     camera = None
     if camera_spec is not None:
         size = (1280, 720) if camera_spec.startswith("fov:") else (None, None)
@@ -56,4 +58,4 @@ def check(part: str, unit: str | None, camera_spec: str | None, others: tuple[st
         findings = []
     if beside:
         findings += [one.finding() for one in guideviews.compare_parts(loaded, beside)]
-    click.echo(check_part(loaded, camera).with_findings(findings).format())
+    click.echo(cad.check_part(loaded, camera).with_findings(findings).format())

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 import click
 
 from arview import guideviews, tracking
-from arview.cli.exit_codes import ExitCode, help_rows
+from arview.cli.exit_codes import ExitCode, group_rows, help_rows
 from arview.core.atomic import is_device
 from arview.core.plug_ins import find_plug_ins, load_plug_in
 from arview.core.progress import Progress, StepProgress
@@ -31,8 +31,16 @@ if TYPE_CHECKING:
 
 COMMANDS_GROUP = "arview.commands"
 """Entry-point group of commands that other packages add."""
-MODALITIES = ("region", "edge", "feature")
+MODALITIES = ("region", "edge", "texture")
 _STORAGE_ERRORS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS})
+
+
+SECTIONS = {
+    "Inspect": ("inspect", "annotate", "live", "measure", "reconstruct", "capture", "batch"),
+    "Set up": ("check", "studio", "guideviews", "calibrate", "verify"),
+    "Record": ("report", "export", "rework", "decisions", "history", "inspection", "compare"),
+}
+"""Commands in the help of the program; those that are not named follow under "More"."""
 
 
 class Command(click.Command):
@@ -57,7 +65,7 @@ class Group(click.Group):
     def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the epilog and the table of exit codes."""
         super().format_epilog(ctx, formatter)
-        _write_exit_codes(formatter, [(str(int(code)), code.meaning) for code in ExitCode])
+        _write_exit_codes(formatter, group_rows())
 
 
 def _write_exit_codes(formatter: click.HelpFormatter, rows: list[tuple[str, str]]) -> None:
@@ -81,6 +89,16 @@ class _Program(Group):
     """The whole program: every way to end is turned into an exit code and at most one line on stderr."""
 
     group_class = Group
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the commands in sections, see `SECTIONS`."""
+        left = {name: self.get_command(ctx, name) for name in self.list_commands(ctx)}
+        for title, names in (*SECTIONS.items(), ("More", tuple(left))):
+            found = [(name, left.pop(name)) for name in names if name in left]
+            rows = [(name, command.get_short_help_str(88)) for name, command in found if command is not None]
+            if rows:
+                with formatter.section(title):
+                    formatter.write_dl(rows)
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         """Names of arview's own commands and of those that other packages add, in alphabetical order."""
@@ -245,28 +263,19 @@ def say(text: str) -> None:
 
 @click.group(
     cls=_Program,
-    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
+    context_settings={
+        "help_option_names": ["-h", "--help"],
+        "max_content_width": 100,
+        # Help that is piped into a file or a pager is not broken at 80 columns.
+        "terminal_width": None if sys.stdout is not None and sys.stdout.isatty() else 100,
+    },
     epilog="""\b
 Examples:
-  arview inspect --part part.toml --photos photos/ --video walk.mp4 -o out/
-  arview check bracket.step
-  arview annotate clip.mp4 --part part.toml --camera camera.json --inspection inspection.json
-  arview reconstruct photos/ --part part.toml -o out/
-  arview live --part part.toml --inspection inspection.json
-
-\b
-PART is a part file (part.toml; `arview check --help` shows one) or a CAD file (STEP, glTF, OBJ,
-STL, PLY, 3MF).
-
-\b
-Shell completion: put one of these lines into the start-up file of your shell.
-  bash   eval "$(_ARVIEW_COMPLETE=bash_source arview)"
-  zsh    eval "$(_ARVIEW_COMPLETE=zsh_source arview)"
-  fish   _ARVIEW_COMPLETE=fish_source arview | source""",
+  arview inspect --part part.toml --photos photos/ --video walk.mp4 -o out/""",
 )
 @click.version_option(__version__, prog_name="arview")
 def main() -> None:
-    """AR inspection of assemblies: find and track a part in video by its CAD, and draw what was measured."""
+    """AR inspection of assemblies: parts tracked in video by their CAD, with measured errors."""
 
 
 def _parse_modalities(ctx: click.Context, parameter: click.Parameter, value: str) -> tuple[str, ...]:
@@ -283,8 +292,8 @@ RENDERER = click.option(
     type=click.Choice(["auto", "pyrender", "zbuffer"]),
     default="auto",
     show_default=True,
-    help="Renderer of the guide views: pyrender draws with OpenGL, zbuffer on the processor and without any library; "
-    "auto takes pyrender where there is a GPU. Both draw the same views.",
+    metavar="NAME",
+    help="Draws guide views: pyrender, zbuffer or auto.",
 )
 MODALITY = click.option(
     "--modalities",
@@ -292,7 +301,7 @@ MODALITY = click.option(
     default=",".join(MODALITIES),
     show_default=True,
     metavar="LIST",
-    help="Modalities the tracker uses, separated by commas.",
+    help="Tracker's modalities.",
 )
 
 
@@ -301,7 +310,7 @@ def session_options(modalities: tuple[str, ...]) -> tracking.SessionOptions:
     return tracking.SessionOptions(
         use_region="region" in modalities,
         use_edge="edge" in modalities,
-        use_texture="feature" in modalities,
+        use_texture="texture" in modalities,
         # The pose recheck needs edges and colours.
         use_recheck={"region", "edge"} <= set(modalities),
     )

@@ -36,7 +36,7 @@ _MEANINGS = {
     ExitCode.FAIL: "a check fails",
     ExitCode.UNDECIDED: "nothing fails, but something is undecided",
     ExitCode.CANNOT_MEASURE: "the input can be read but not measured",
-    ExitCode.BAD_INPUT: "bad input or usage, or an output that cannot be written",
+    ExitCode.BAD_INPUT: "bad input or usage, or no output can be written",
     ExitCode.BUG: "a bug in arview",
     ExitCode.INTERRUPTED: "interrupted",
     ExitCode.CLOSED_PIPE: "the reader of the output closed the pipe",
@@ -58,14 +58,24 @@ def exit_code_of(verdict: str) -> ExitCode:
 
 
 def help_rows(results: dict[ExitCode, str] | None = None) -> list[tuple[str, str]]:
-    """Rows of the table of exit codes in a command's help: the code and its meaning.
+    """Rows of the table of exit codes in a command's help: the code, or several, and what they mean.
 
     Args:
         results: what the results of this command mean; those not named are left out, except 0. Errors may be named
-            too, to say more of them.
+            too, to say more of them; the others share a row.
     """
-    meanings = {ExitCode.DONE: "done"} | {code: code.meaning for code in _ERRORS} | (results or {})
-    return [(str(int(code)), meanings[code]) for code in sorted(meanings)]
+    meanings = {ExitCode.DONE: "done"} | (results or {})
+    others = [code for code in _ERRORS if code not in meanings]
+    rows = [(str(int(code)), meanings[code]) for code in sorted(meanings)]
+    return [*rows, (", ".join(str(int(code)) for code in others), "; ".join(code.meaning for code in others))]
+
+
+def group_rows() -> list[tuple[str, str]]:
+    """Rows of the table of exit codes in the help of a group of commands: results share one row, errors another."""
+    results = [code for code in ExitCode if code < ExitCode.BAD_INPUT]
+    meanings = {ExitCode.DONE: "; ".join(code.meaning for code in results)}
+    (_, told), errors = help_rows(meanings)
+    return [(", ".join(str(int(code)) for code in results), told), errors]
 
 
 def finding_exit_code(summary: AnnotateSummary) -> ExitCode:

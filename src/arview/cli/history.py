@@ -358,7 +358,9 @@ def export(
     epilog="""\b
 Examples:
   arview history check
-  arview history check --store /data/plate.sqlite""",
+  arview history check --store /data/plate.sqlite
+
+Notes on it: docs/reference/command-notes.md""",
     exit_codes={ExitCode.DONE: "every result is as it was added", ExitCode.FAIL: "a result is damaged"},
 )
 @STORE

@@ -26,40 +26,12 @@ Examples:
   arview inspect --part part.toml --photos photos/ --video walk.mp4 --serial PL-0417 -o out/
   arview inspect --part part.toml --video walk.mp4 -o out/
   arview inspect --part part.toml --photos photos/ -o out/ --store /data/plate.sqlite --station cell-3
-
-\b
-Runs `arview reconstruct`, `measure`, `report` and `annotate` in one go. OUT holds
-  inspection.json              displacement, U and verdict of each component
-  report.html, report.pdf      the report
-  inspection_distances/        the cloud coloured by its distance to the CAD, pictures, histograms
-  annotated.mp4, poses.jsonl   the video with ghost and measured errors, the pose of each frame
-and the files of the stages. Each stage is identified by the content of its inputs: finished stages
-are not repeated, an interrupted run resumes where it stopped, and a change repeats what depends on it.
-Results of other inputs are removed before the work begins.
-
-\b
-Without --photos, sharp and well-spread frames of the video are measured. The scale comes from the CAD,
-unless --scale-file names boards, tags or scale bars in view (`arview reconstruct --help`). The video is
-given the camera of the photos where the frames have the same aspect ratio. A phone crops videos
-differently: give --video-camera then.
-
-\b
-With 16 photos or more, two interleaved halves of them are adjusted and measured apart, and the report
-compares them with their U. Where they differ by more, U is enlarged. --no-repeatability leaves this out.
-
-\b
---masks auto is for a part that moves against its background, see `arview reconstruct --help`. Components
-are measured in the whole photos: masks never hide one that is displaced.
-
-\b
-A video or PDF that cannot be made is a warning: the verdict stands without it.""",
+  Notes: docs/reference/command-notes.md""",
     exit_codes={
         ExitCode.DONE: "pass: every component passes or has no tolerance, and there is no foreign object",
         ExitCode.FAIL: "fail: a component fails or is missing",
-        ExitCode.UNDECIDED: "undecided: none fails, but one is undecided or was not measured, or there is a foreign "
-        "object",
-        ExitCode.CANNOT_MEASURE: "no component could be measured: the photos are unusable, do not fit together, do not "
-        "show the part, or contradict its CAD",
+        ExitCode.UNDECIDED: "undecided: none fails; one is undecided, not measured, or there is a foreign object",
+        ExitCode.CANNOT_MEASURE: "no component could be measured: unusable photos, or they contradict the CAD",
         ExitCode.INTERRUPTED: "interrupted; finished stages are kept",
     },
 )
@@ -69,25 +41,21 @@ A video or PDF that cannot be made is a warning: the verdict stands without it."
 @click.option("-o", "--output", required=True, metavar="OUT", help="Folder for all results.")
 @click.option("--serial", metavar="SERIAL", help="Serial number of the specimen; default: that of the part file.")
 @click.option("--store", metavar="FILE|URL", help="Also add the result to this store (`arview history`).")
-@click.option(
-    "--station", metavar="NAME", help="Name of the measuring station; default: ARVIEW_STATION or this machine."
-)
+@click.option("--station", metavar="NAME", help="Name of the measuring station; default: this machine.")
 @click.option("--camera", metavar="CAMERA", help="Calibrated camera file of the photos, or fov:DEG.")
 @click.option("--video-camera", metavar="CAMERA", help="The same for the video, if it was taken with another camera.")
 @click.option("--scale-file", metavar="FILE", help="TOML file of the boards, tags, scale bars and rig in view.")
 @click.option(
     "--masks",
     metavar="FOLDER|auto",
-    help="Masks as IMAGE.png, black where a photo is not to be used; auto: made of the CAD.",
+    help="Masks IMAGE.png, black: not used; auto: from the CAD.",
 )
 @click.option(
     "--sparse",
     metavar="FOLDER|FILE",
-    help="Camera poses made elsewhere: COLMAP model, Metashape XML or transforms.json.",
+    help="Camera poses by COLMAP, Metashape or nerfstudio.",
 )
-@click.option(
-    "--pairs", metavar="FILE", help="Match only the pairs of photos that another run matched: its sparse/pairs.json."
-)
+@click.option("--pairs", metavar="FILE", help="Match only the pairs of sparse/pairs.json of a run.")
 @click.option(
     "--tolerance",
     type=click.FloatRange(min=0, min_open=True),
@@ -100,7 +68,7 @@ A video or PDF that cannot be made is a warning: the verdict stands without it."
     default=1.0,
     show_default=True,
     metavar="G",
-    help="Guard band as a multiple of U; 0 is simple acceptance.",
+    help="Guard band as a multiple of U.",
 )
 @click.option(
     "--max-frames",
@@ -121,7 +89,7 @@ A video or PDF that cannot be made is a warning: the verdict stands without it."
     default="auto",
     show_default=True,
     metavar="auto|cpu|cuda[:N]",
-    help="Device for features, matching and the dense cloud, see `arview reconstruct --help`.",
+    help="Device for features, matching, cloud.",
 )
 @click.option("--force", is_flag=True, help="Repeat all stages, even those already finished in OUT.")
 @UNIT
@@ -150,7 +118,7 @@ def inspect(
     force: bool,
     unit: str | None,
 ) -> None:
-    """Inspect one part: reconstruct PHOTOS, measure and decide; write report, coloured cloud, annotated VIDEO."""
+    """Inspect one part: reconstruct PHOTOS, measure and decide; write report and VIDEO."""
     job = workflow.InspectJob(
         part_path,
         photos,

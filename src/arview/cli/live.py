@@ -95,53 +95,7 @@ Examples:
   arview live --part part.toml --source 0 --camera webcam.json
   arview live --part part.toml --source rtsp://camera.local/1 --camera station.json
   arview live --part part.toml --source clip.mp4 --camera camera.json --http
-  arview live --part a.toml --part b.toml --inspection a.json --inspection b.json --camera phone.json
-  arview live --part part.toml --instances 2 --camera phone.json
-
-\b
-Point a phone in the same network at the printed code. The first time, the phone has to be told to trust
-the station, because browsers give the camera to secure pages only; the second address that is printed
-explains how. Nothing is installed on the phone and nothing leaves the local network. The link holds a
-token that is new in each run: whoever opens it during the run is paired, and stays so in later runs.
---devices lists the paired devices, --revoke NAME forgets one; with both, what is left is listed.
-
-\b
-SOURCE phone: every phone sends its own camera and has its own tracker. A camera number, an RTSP or HTTP
-address, or a file (played in a loop at its own rate): all pages show that picture. --http serves the
-browser of this machine only, without certificates, for trying things out.
-
-\b
-CAMERA is a file (arview or BOP JSON, OpenCV YAML/XML/JSON, ROS camera_info, Kalibr camchain, COLMAP cameras.txt,
-Metashape XML, RealSense JSON, nerfstudio transforms.json; FILE:NAME for one of several cameras in it) or fov:DEG. It
-is scaled to the frames if their aspect ratio is the same. Without it a common phone is assumed, and the
-page says so, until the focal length has been estimated from views of the part from near and from several
-sides. --save-profile NAME keeps the estimate at the end, for --camera profile:NAME.
-
-\b
-When another part of the same kind is in view and it is not certain which one is tracked, labels are
-withheld until the followed one is seen again, a code on the part gives the serial number, or the button
-"This is the part" (key C) is pressed.
-
-\b
-A page can start the inspection of a specimen by its serial number: photos, measurement, rework, decisions. Each is
-a folder in --jobs (arview_jobs in the current folder, made with the first one); what the page has confirmed is
-there after a crash, and the next start continues measurements that are not finished. Full-size photos of a phone
-show more than its video: --photo-camera is their calibrated camera, else it is estimated from them (--camera is used
-if --size has the shape 4:3 of photos).
-
-\b
-Several at once. --part may be given again, and --instances N shows N specimens of each part. Each has a name
-(the part's, with #1, #2 where several have the same), a colour and a mark of its own on labels and ghost, a line
-with its state, and its own button to confirm it (keys 1 to 9). Inspections belong to the specimens in their order.
-A camera that is not given is guessed and not estimated then.
-
-\b
-The page reloads inspection.json when it changes, and warns when it is older than --max-age or has another
-serial number than the part file (or --serial). Recordings made from the page are put in the folder of
---record, or in the current one. Beside each video is a file of its poses that ends in .jsonl, see annotate; its
-lines have the numbers of the frames in the video. A recording ends by itself, and the page says so, when all in
-the folder reach --quota or the disk is almost full. Ctrl-C ends the run and finishes the files, within five
-seconds.""",
+  Notes: docs/reference/command-notes.md""",
     exit_codes={ExitCode.INTERRUPTED: "ended by Ctrl-C; files are finished"},
 )
 @click.option(
@@ -159,24 +113,20 @@ seconds.""",
     "inspection_paths",
     multiple=True,
     metavar="FILE",
-    help="inspection.json whose values are shown; again for further specimens, in their order.",
+    help="inspection.json to show; again for further specimens.",
 )
-@click.option(
-    "--source", default="phone", show_default=True, metavar="SOURCE", help="Camera or video to show; see below."
-)
-@click.option("--camera", "camera_spec", metavar="CAMERA", help="Camera file or fov:DEG; see below.")
-@click.option("--photo-camera", metavar="CAMERA", help="Camera of the full-size photos of phones; see below.")
-@click.option("--save-profile", "profile", metavar="NAME", help="Keep the estimated camera as a profile; see below.")
+@click.option("--source", default="phone", show_default=True, metavar="SOURCE", help="Camera or video to show.")
+@click.option("--camera", "camera_spec", metavar="CAMERA", help="Camera file or fov:DEG.")
+@click.option("--photo-camera", metavar="CAMERA", help="Camera of the full-size photos of phones.")
+@click.option("--save-profile", "profile", metavar="NAME", help="Keep the estimated camera as a profile.")
 @click.option("--init", metavar="guide:NAME", help="Align the part with an outline first, as in annotate.")
-@click.option(
-    "--host", metavar="ADDRESS", help="Address to listen at; default: the one in the local network. 0.0.0.0: all."
-)
+@click.option("--host", metavar="ADDRESS", help="Address to listen at; default: in the local network.")
 @click.option(
     "--port",
     type=click.IntRange(0, 65534),
     default=8443,
     show_default=True,
-    help="Port of the pages; the page about the certificate gets the next one.",
+    help="Port of the pages.",
 )
 @click.option("--http", "is_plain", is_flag=True, help="Plain HTTP for a browser on this machine.")
 @click.option("--cert", metavar="PEM", type=click.Path(path_type=Path), help="Your own certificate chain.")
@@ -185,25 +135,25 @@ seconds.""",
     "--clients",
     type=click.IntRange(1, 64),
     metavar="N",
-    help="Most pages at once; default: 2 phones, or 8 pages of a station camera.",
+    help="Most pages at once; default: 2 phones or 8 viewers.",
 )
-@click.option("--record", metavar="OUT.mp4", help="Record from the start; the video of a second phone is OUT-2.mp4.")
+@click.option("--record", metavar="OUT.mp4", help="Record from the start.")
 @click.option(
     "--quota",
     type=click.FloatRange(0, min_open=True),
     default=20.0,
     show_default=True,
     metavar="GB",
-    help="Largest size of all recordings in their folder.",
+    help="Largest size of all recordings.",
 )
-@click.option("--serial", metavar="TEXT", help="Serial number of the part in view; default: that of the part file.")
+@click.option("--serial", metavar="TEXT", help="Serial number of the part in view.")
 @click.option(
     "--max-age",
     callback=_parse_age,
     default="24h",
     show_default=True,
     metavar="AGE",
-    help="Age from which an inspection is called old: 8h, 3d, 90min, never.",
+    help="Age at which an inspection is old, or never.",
 )
 @click.option(
     "--jobs",
@@ -212,7 +162,7 @@ seconds.""",
     type=click.Path(file_okay=False),
     default="arview_jobs",
     show_default=True,
-    help="Folder of the inspections that pages start; it is made with the first one.",
+    help="Folder of the inspections.",
 )
 @click.option(
     "--devices",
@@ -229,7 +179,7 @@ seconds.""",
     is_eager=True,
     expose_value=False,
     callback=_keep_device_option,
-    help="Forget a paired device, of a running station too, and exit; may be given again.",
+    help="Forget a paired device, and exit.",
 )
 @click.option(
     "--size",

@@ -36,30 +36,7 @@ Examples:
   arview measure out/ --part plate.step --photos photos/ --methods edges --guard 0
   arview measure --cloud scan.ply --part part.toml
   arview measure --cloud scan.csv --cloud-unit m --rescale --part part.toml
-
-\b
-OUT is the folder of `arview reconstruct --part`. If the part was not found there, or with --cloud, the
-part is located by the shape of the cloud. Components of the role 'inspect' are measured, in the photos
-twice (sweep: by their surface; edges: by their edges) and in the cloud if there is one. Sweep and edges
-together give the result; the cloud is for comparison. Displacements are in the frame of the part file's
-datums. Degrees of freedom that the datums leave free, or all of them without datums, are fixed by the
-best fit of the base component. A cloud alone is found in any frame, among other things and in
-part; what it does not show is not measured. If its scale contradicts the size of the base, the factor
-is named and U includes the difference; --rescale divides by it.
-
-\b
-dx, dy and dz are the displacement of the centre of a component's
-bounding box; ? means undetermined. U is the expanded uncertainty (k = 2; for small distances, chosen so
-that the interval holds the true distance with 95 % probability).
-
-\b
-A component passes when distance + guard * U is within its tolerance, fails when distance - guard * U
-exceeds it, and is undecided otherwise (ISO 14253-1). Tolerances come from the part file, else from
---tolerance. They are radii; position tolerance zones on drawings (ISO 1101) are diameters, twice as
-large. INSPECTION holds covariance, methods, uncertainty budget and datums; `arview annotate --inspection`
-draws it. Where there is a cloud, surfaces that belong to nothing in the CAD are reported as foreign
-objects, and the signed distances of the points to the nominal CAD are written to the folder
-INSPECTION_distances: coloured PLY, a picture, histograms.""",
+  Notes: docs/reference/command-notes.md""",
     exit_codes={
         ExitCode.DONE: "every component passes or has no tolerance, and there is no foreign object",
         ExitCode.FAIL: "a component fails or is missing",
@@ -72,7 +49,7 @@ INSPECTION_distances: coloured PLY, a picture, histograms.""",
     "--cloud",
     "cloud_path",
     metavar="FILE",
-    help="Measure a cloud instead, in any frame: PLY, PCD, XYZ, PTS, CSV, LAS, LAZ or E57.",
+    help="Measure a cloud instead: PLY, PCD, XYZ, PTS, CSV, LAS, E57.",
 )
 @click.option("--cloud-unit", metavar="UNIT", help="Unit of the cloud: mm, cm, m, inch, ft, um; default: by its size.")
 @click.option(
@@ -93,7 +70,7 @@ INSPECTION_distances: coloured PLY, a picture, histograms.""",
     default=1.0,
     show_default=True,
     metavar="G",
-    help="Guard band as a multiple of U; 0 is simple acceptance.",
+    help="Guard band as a multiple of U.",
 )
 @click.option(
     "--methods",

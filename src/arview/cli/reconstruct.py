@@ -27,57 +27,28 @@ Examples:
   arview reconstruct photos/ --part part.toml --board charuco:8x6:30:22:DICT_5X5_100 -o out/
   arview reconstruct photos/ --scale-bar 3:7:412.55 -o out/
   arview reconstruct photos/ --part part.toml --until sparse -o out/
-
-\b
-Photos: 20 to 60 of them, 10 to 20 degrees apart, all around and from two heights, the part standing
-still, zoom and focus unchanged, with texture around the part (a patterned mat, printed sheets). JPEG,
-PNG, TIFF, HEIC. Without --camera the lens is calibrated from the photos themselves; photos taken with
-different lenses or zooms are told apart.
-
-\b
-The scale comes from what is known, in this order of trust; several sources are combined:
-  --board charuco:COLUMNSxROWS:SQUARE:MARKER:DICTIONARY, or grid:COLUMNSxROWS:MARKER:GAP:DICTIONARY (mm)
-  --tag DICTIONARY:SIDE               every tag of the dictionary has this side in mm: apriltag36h11:20
-  --scale-bar [DICTIONARY:]ID1:ID2:LENGTH   distance of the centres of two tags, known to 0.02 mm
-  --scale-file FILE                   all of these in a TOML file: [[board]] spec = "...", [[tag]],
-                                      [[scale_bar]], [rig]
-  --rig FILE.json                     centres_mm, cam_from_rig_mm or distances_mm of the cameras
-  --part PART                         the CAD, found in the photos; it also gives the frame. The base
-                                      component is assumed to be as drawn: only a measured length can
-                                      show that it is not
-
-\b
---masks auto is for a part that moves against its background (a turntable, a part held in the hand). If
-the photos cannot be placed, or the CAD contradicts their poses, the part is detected in each photo, and
-they are placed by its pixels alone. Otherwise the poses stand and the masks limit the dense cloud. They
-reach 10 mm beyond the silhouette. If the part is not found, a warning says why and no masks are used.
-A folder named auto is given as ./auto.
-
-\b
-OUT holds the files of every stage: photos.json, sparse/ (COLMAP model, points.ply), scale.json, metric/
-(COLMAP model in mm in the frame of the CAD), dense/ (depth maps in COLMAP's format), cloud.ply and
-reconstruction.json. An interrupted run resumes where it stopped; --force starts over.""",
+  Notes: docs/reference/command-notes.md""",
     exit_codes={ExitCode.CANNOT_MEASURE: "the photos can be read but not reconstructed"},
 )
 @click.argument("source", metavar="PHOTOS|VIDEO")
 @click.option("--part", "part_path", metavar="PART", help="Part file or CAD file.")
 @click.option("-o", "--output", required=True, metavar="OUT", help="Folder for the files of all stages.")
-@click.option("--camera", metavar="CAMERA", help="Calibrated camera file, profile[:NAME], or fov:DEG as a first guess.")
-@click.option("--board", "boards", multiple=True, metavar="SPEC", help="Board of known size in view; see below.")
-@click.option("--tag", "tags", multiple=True, metavar="SPEC", help="Tags of known size in view; see below.")
-@click.option("--scale-bar", "bars", multiple=True, metavar="SPEC", help="Known distance of two tags; see below.")
+@click.option("--camera", metavar="CAMERA", help="Camera file, profile[:NAME] or fov:DEG.")
+@click.option("--board", "boards", multiple=True, metavar="SPEC", help="Board of known size in view.")
+@click.option("--tag", "tags", multiple=True, metavar="SPEC", help="Tags of known size in view.")
+@click.option("--scale-bar", "bars", multiple=True, metavar="SPEC", help="Known distance of two tags.")
 @click.option("--scale-file", metavar="FILE", help="Boards, tags, scale bars and rig in one TOML file.")
 @click.option("--rig", metavar="FILE", help="Known camera poses in mm.")
 @click.option(
     "--sparse",
     "poses",
     metavar="FOLDER|FILE",
-    help="Camera poses made elsewhere: COLMAP model, Metashape XML or transforms.json.",
+    help="Camera poses by COLMAP, Metashape or nerfstudio.",
 )
 @click.option(
     "--masks",
     metavar="FOLDER|auto",
-    help="Masks as IMAGE.png, black where a photo is not to be used; auto: made of the CAD.",
+    help="Masks IMAGE.png, black: not used; auto: from the CAD.",
 )
 @click.option("--until", type=click.Choice(STAGES), default="dense", show_default=True, help="Last stage to do.")
 @click.option(
@@ -86,7 +57,7 @@ reconstruction.json. An interrupted run resumes where it stopped; --force starts
     default=5.0,
     show_default=True,
     metavar="MM",
-    help="Distance of components from their nominal place that the dense stage covers.",
+    help="Displacements that the dense stage covers.",
 )
 @click.option(
     "--max-frames",
@@ -103,7 +74,7 @@ reconstruction.json. An interrupted run resumes where it stopped; --force starts
     default="auto",
     show_default=True,
     metavar="auto|cpu|cuda[:N]",
-    help="Device for features, matching and the dense cloud; auto takes a CUDA GPU if torch (extra gpu) finds one.",
+    help="Device for features, matching, cloud.",
 )
 @click.option("--force", is_flag=True, help="Repeat all stages, even those already finished in OUT.")
 @UNIT

@@ -144,12 +144,24 @@ BY = click.option("--by", required=True, metavar="NAME", help="Who decides or si
 NOTE = click.option("--note", default="", metavar="TEXT", help="Anything else.")
 
 
-@main.command(
+@main.group(
+    short_help="Decide about components, sign, list what was decided.",
+    epilog="""\b
+Examples:
+  arview decisions decide out/ link_1 --not-ok --reason "weld cracked" --by Ada
+  arview decisions sign out/ --by "Grace Hopper"
+  arview decisions list out/""",
+)
+def decisions() -> None:
+    """Decisions by people about an inspection: kept beside it, line by line, and never changed."""
+
+
+@decisions.command(
     short_help="Decide about a component: OK or not OK, and why.",
     epilog="""\b
 Examples:
-  arview decide out/ link_1 --not-ok --reason "weld cracked" --by Ada
-  arview decide out/ post_1 --ok --reason "agreed with the customer" --by Ada --photo 0003.jpg
+  arview decisions decide out/ link_1 --not-ok --reason "weld cracked" --by Ada
+  arview decisions decide out/ post_1 --ok --reason "agreed with the customer" --by Ada --photo 0003.jpg
 
 \b
 JOB is a job folder, or an inspection.json. Decisions are appended to decisions.jsonl beside it and are
@@ -176,12 +188,12 @@ def decide(
     _told_state(job)
 
 
-@main.command(
+@decisions.command(
     short_help="Sign an inspection.",
     epilog="""\b
 Examples:
-  arview sign out/ --by "Grace Hopper"
-  arview sign out/ --by "Grace Hopper" --note "shift 2" --store /data/plate.sqlite
+  arview decisions sign out/ --by "Grace Hopper"
+  arview decisions sign out/ --by "Grace Hopper" --note "shift 2" --store /data/plate.sqlite
 
 \b
 The part is released if each component passed or was accepted with a reason, and none was rejected;
@@ -215,12 +227,13 @@ def sign(job: str, note: str, by: str, store: str | None) -> None:
     click.get_current_context().exit(ExitCode.DONE if is_released else ExitCode.FAIL)
 
 
-@main.command(
+@decisions.command(
+    "list",
     short_help="List the decisions about an inspection, and check that none was changed.",
     epilog="""\b
 Examples:
-  arview decisions out/
-  arview decisions out/ -o decisions.csv""",
+  arview decisions list out/
+  arview decisions list out/ -o decisions.csv""",
     exit_codes={
         ExitCode.DONE: "the log is as it was written",
         ExitCode.FAIL: "a line was changed or removed; it is named",
@@ -228,7 +241,7 @@ Examples:
 )
 @click.argument("job", metavar="JOB")
 @click.option("-o", "--output", metavar="CSV", help="Write them as CSV.")
-def decisions(job: str, output: str | None) -> None:
+def list_decisions(job: str, output: str | None) -> None:
     """List the decisions, ticks and signatures of JOB."""
     from arview.inspection import load_inspection
 

@@ -31,29 +31,7 @@ Examples:
   arview verify out/inspection.json certificate.toml --mpe 0.05+L/5000 -o verify.json --plot verify.png
   arview verify points.csv lengths.csv --mpe 0.2
   arview verify out/inspection.json cmm.csv
-
-\b
-MEASURED is an inspection.json (the centres of its components are the marks), the folder it is in, or a
-CSV of points with the columns name,x,y,z and optionally U_mm (k = 2, of each coordinate). KNOWN is the
-truth.json of a rendered sample (all lengths between its components), a CSV with the columns
-from,to,mm,U_mm, or TOML:
-  [[length]]
-  between = ["post_1", "post_3"]
-  mm = 221.268
-  U_mm = 0.004        # k = 2, from the certificate; default 0
-
-\b
-Following VDI/VDE 2634 part 1, the error of each length, measured minus known, is compared with the
-maximum permissible error --mpe (A + L/K, at most B). A length passes when |error| + U of the known length
-is within it, fails when |error| - U exceeds it, and is undecided otherwise (ISO 14253-1). The stated U is
-confirmed when as many errors are within U as must be expected: by the binomial distribution if no two
-lengths share a mark, by simulation otherwise.
-
-
-KNOWN may also be the list of another measurement, such as a measuring machine's: columns name and x, y, z
-(centre of the component's bounding box) or dx, dy, dz (measured minus nominal), in the datum frame, and U
-(k = 2), in mm; separated by ; or , or tabs, decimal point or comma. Then each component gets an E_n
-number (ISO/IEC 17043): up to 1, both agree within their U.""",
+  Notes: docs/reference/command-notes.md""",
     exit_codes={
         ExitCode.DONE: "every length passes, and the stated U is confirmed; every E_n is at most 1",
         ExitCode.FAIL: "a length fails, or the stated U is too small, or an E_n is above 1",

@@ -166,7 +166,7 @@ def test_components_that_were_checked_again_are_beside_their_first_measurement(j
     folder.mkdir(parents=True)
     block = deviation("block_2", (0.1, 0.0, 0.0), CENTER["block_2"])
     save_inspection(inspection(MODEL, (block,), minutes=10), folder / "inspection.json")
-    assert run("sign", folder, "--by", "Grace", "--store", tmp_path / "results.sqlite").exit_code == 0
+    assert run("decisions", "sign", folder, "--by", "Grace", "--store", tmp_path / "results.sqlite").exit_code == 0
     page = (job / "report.html").read_text()
     section = page.split('<section id="decisions">')[1].split("</section>")[0]
     assert "Checked again after rework" in section
@@ -293,23 +293,23 @@ def test_the_history_commands_show_them(job: Path, tmp_path: Path) -> None:
 
 def test_decide_and_sign(job: Path, tmp_path: Path) -> None:
     make_report(job / "inspection.json", job / "report.html")
-    done = run("decide", job, "block_2", "--not-ok", "--reason", "to be moved", "--by", "Ada")
+    done = run("decisions", "decide", job, "block_2", "--not-ok", "--reason", "to be moved", "--by", "Ada")
     assert done.exit_code == 0 and "entry 1: block_2 not OK, Ada" in done.output, done.output
-    done = run("sign", job, "--by", "Grace")
+    done = run("decisions", "sign", job, "--by", "Grace")
     assert done.exit_code == ExitCode.FAIL and "not released: not OK: block_2: to be moved" in done.output
-    run("decide", job, "block_2", "--ok", "--reason", "moved by hand", "--by", "Ada")
+    run("decisions", "decide", job, "block_2", "--ok", "--reason", "moved by hand", "--by", "Ada")
     where = tmp_path / "results.sqlite"
-    done = run("sign", job / "inspection.json", "--by", "Grace", "--store", where)
+    done = run("decisions", "sign", job / "inspection.json", "--by", "Grace", "--store", where)
     assert done.exit_code == 0 and "4 new entries" in done.output, done.output
     assert "released by Grace" in (job / "report.html").read_text()
-    listed = run("decisions", job, "-o", tmp_path / "out.csv")
+    listed = run("decisions", "list", job, "-o", tmp_path / "out.csv")
     assert listed.exit_code == 0 and listed.output.count("Ada: decision block_2") == 2
     assert len((tmp_path / "out.csv").read_text().splitlines()) == 5
 
 
 def test_a_store_that_cannot_be_used_is_told_before_signing(job: Path, tmp_path: Path) -> None:
     (tmp_path / "garbage.sqlite").write_bytes(bytes(range(256)) * 20)
-    done = run("sign", job, "--by", "Grace", "--store", tmp_path / "garbage.sqlite")
+    done = run("decisions", "sign", job, "--by", "Grace", "--store", tmp_path / "garbage.sqlite")
     assert done.exit_code == ExitCode.BAD_INPUT and "is not a results store" in done.output, done.output
     assert not (job / "decisions.jsonl").exists()
 
@@ -317,13 +317,13 @@ def test_a_store_that_cannot_be_used_is_told_before_signing(job: Path, tmp_path:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("decide", "{job}", "block_2", "--by", "Ada"), "give --ok or --not-ok"),
-        (("decide", "{job}", "block_9", "--ok", "--reason", "r", "--by", "Ada"), "no component 'block_9'"),
-        (("decide", "{job}", "block_2", "--ok", "--by", "Ada"), "reason: is empty"),
-        (("decide", "{job}", "block_2", "--ok", "--reason", "r", "--by", " "), "by: is empty"),
-        (("decide", "nothing", "block_2", "--ok", "--reason", "r", "--by", "Ada"), "no such inspection"),
-        (("sign", "nothing", "--by", "Ada"), "no such inspection"),
-        (("decisions", "nothing"), "no such inspection"),
+        (("decisions", "decide", "{job}", "block_2", "--by", "Ada"), "give --ok or --not-ok"),
+        (("decisions", "decide", "{job}", "block_9", "--ok", "--reason", "r", "--by", "Ada"), "no component 'block_9'"),
+        (("decisions", "decide", "{job}", "block_2", "--ok", "--by", "Ada"), "reason: is empty"),
+        (("decisions", "decide", "{job}", "block_2", "--ok", "--reason", "r", "--by", " "), "by: is empty"),
+        (("decisions", "decide", "nothing", "block_2", "--ok", "--reason", "r", "--by", "Ada"), "no such inspection"),
+        (("decisions", "sign", "nothing", "--by", "Ada"), "no such inspection"),
+        (("decisions", "list", "nothing"), "no such inspection"),
         (("rework", "nothing", "--part", "nothing"), "no such file"),
     ],
 )
@@ -337,9 +337,9 @@ def test_a_changed_log_fails_the_check(job: Path) -> None:
     accept(job)
     log = log_of(job).path
     log.write_bytes(log.read_bytes().replace(b"agreed", b"Agreed"))
-    done = run("decisions", job)
+    done = run("decisions", "list", job)
     assert done.exit_code == ExitCode.FAIL and "line 1 was changed" in done.output
-    done = run("sign", job, "--by", "Grace")
+    done = run("decisions", "sign", job, "--by", "Grace")
     assert done.exit_code == ExitCode.BAD_INPUT and "line 1 was changed" in done.output
 
 

@@ -47,6 +47,9 @@ def job(tmp_path: Path) -> Path:
     return tmp_path
 
 
+DECIDE = ("decisions", "decide")
+
+
 def test_without_decisions_nothing_is_said(job: Path) -> None:
     state = state_of_record(job)
     assert state.sentence == "" and not state.is_released and state.signature is None
@@ -320,8 +323,12 @@ def test_a_photo_is_checked_where_the_job_has_no_folder_of_photos(job: Path) -> 
 
 
 def test_ok_and_not_ok_exclude_each_other(job: Path) -> None:
-    both = CliRunner().invoke(main, ["decide", str(job), "block_2", "--ok", "--not-ok", "--reason", "r", "--by", "Ada"])
+    both = CliRunner().invoke(
+        main, ["decisions", "decide", str(job), "block_2", "--ok", "--not-ok", "--reason", "r", "--by", "Ada"]
+    )
     assert both.exit_code == 64 and "give either --ok or --not-ok, not both" in both.stderr
     assert not log_of(job).content().entries
-    one = CliRunner().invoke(main, ["decide", str(job), "block_2", "--not-ok", "--reason", "r", "--by", "Ada"])
+    one = CliRunner().invoke(
+        main, ["decisions", "decide", str(job), "block_2", "--not-ok", "--reason", "r", "--by", "Ada"]
+    )
     assert one.exit_code == 0 and [entry.is_ok for entry in log_of(job).content().entries] == [False]
