@@ -5,7 +5,10 @@ READY := .venv/.ready
 DEMO_READY := .venv/.ready-demo
 SAMPLE := samples/plate
 # A worker for each core; each test file goes to one worker, in the order of conftest.py.
-PARALLEL := -n auto --dist loadgroup --no-loadscope-reorder
+PARALLEL := -n auto --dist loadgroup --no-loadscope-reorder --durations=10
+# make test ROOM=refinement: the tests of that room and of the rooms that import it.
+ROOM :=
+TESTS = $(if $(ROOM),$$(.venv/bin/python tests/helpers/rooms.py $(ROOM)))
 
 .PHONY: help demo demo-live test test-fast check docs guideviews bench evaluate soak screens clean
 
@@ -13,7 +16,8 @@ help:
 	@echo "make demo      inspect the sample plate: report and annotated video in out/demo"
 	@echo "make demo-live the whole inspection on the live page, unattended: report and pictures in out/demo-live"
 	@echo "make test      formatting, linting, types, all tests: ten minutes on two cores"
-	@echo "make test-fast the quick tests of every room: a minute"
+	@echo "make test ROOM=refinement  the same for one room and the rooms that import it"
+	@echo "make test-fast the quick tests of every room, or of ROOM: a minute"
 	@echo "make check     formatting, linting, types"
 	@echo "make docs      the documentation as a site: out/docs/index.html"
 	@echo "make guideviews the small guide-view sets of the samples in guideviews/"
@@ -42,10 +46,10 @@ demo-live: $(READY)
 	.venv/bin/python tools/demo_live.py -o out/demo-live
 
 test: check
-	.venv/bin/python -m pytest $(PARALLEL)
+	.venv/bin/python -m pytest $(PARALLEL) $(TESTS)
 
 test-fast: $(READY)
-	.venv/bin/python -m pytest $(PARALLEL) -m "not slow and not browser"
+	.venv/bin/python -m pytest $(PARALLEL) -m "not slow and not browser" $(TESTS)
 
 check: $(READY)
 	tools/check

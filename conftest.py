@@ -5,7 +5,9 @@ It lies here because it also holds for the tests of `tools/lab`.
 
 from __future__ import annotations
 
+import json
 import os
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -23,6 +25,8 @@ ROOT = Path(__file__).parent
 TESTS = ROOT / "tests"
 TIMED_ROOMS = ("station.live", "browser")
 """Their tests wait for servers, cameras and browsers: one worker takes them all, one after another."""
+DURATIONS = TESTS / "durations.json"
+"""Seconds that each test file took, by which the longest start first; ARVIEW_RECORD_DURATIONS=1 writes them anew."""
 MARKER_OF_ROOM = {"browser": "browser", "integration": "integration"}
 
 
@@ -60,9 +64,27 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def _weights(items: Sequence[pytest.Item]) -> dict[Path, float]:
-    """How long each file is likely to take: slow tests count for many others, and timed rooms come first of all."""
+    """How long each file is likely to take, in seconds, by the last records; timed rooms come first of all."""
+    known: dict[str, float] = json.loads(DURATIONS.read_text(encoding="utf-8")) if DURATIONS.is_file() else {}
     weights: dict[Path, float] = {}
     for item in items:
-        own = 30.0 if item.get_closest_marker("slow") else 1.0
-        weights[item.path] = weights.get(item.path, 0.0) + own + (1e6 if room(item) in TIMED_ROOMS else 0.0)
+        name = str(item.path.relative_to(ROOT))
+        own = 0.0 if name in known else 10.0 if item.get_closest_marker("slow") else 0.3
+        weights.setdefault(item.path, known.get(name, 0.0) + (1e6 if room(item) in TIMED_ROOMS else 0.0))
+        weights[item.path] += own
     return weights
+
+
+_seconds: Counter[str] = Counter()
+
+
+def pytest_runtest_logreport(report: pytest.TestReport) -> None:
+    """Add up the time of each file."""
+    _seconds[report.location[0]] += report.duration
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """Record the times of a whole run, see `DURATIONS`."""
+    if os.environ.get("ARVIEW_RECORD_DURATIONS") and not IS_WORKER:
+        rows = {name: round(seconds, 1) for name, seconds in sorted(_seconds.items()) if seconds >= 0.5}
+        DURATIONS.write_text(json.dumps(rows, indent=0) + "\n", encoding="utf-8")

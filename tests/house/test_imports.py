@@ -6,6 +6,9 @@ import ast
 from importlib import import_module
 from pathlib import Path
 
+import pytest
+
+from helpers.rooms import folders, room, rooms_with
 from helpers.source_tree import imports, lab_files, modules, source_files, tree
 
 ROOMS = (
@@ -45,16 +48,6 @@ FORBIDDEN = {
 }
 FRONT = {"arview", "arview.__main__", "arview.station", "arview.quality"}
 """The front door and those of the wings, which are of no room."""
-
-
-WINGS = {"arview.station", "arview.quality"}
-"""Packages of rooms. They hold no code themselves."""
-
-
-def room(name: str) -> str:
-    """The room of a module: the folder or module below `arview`, in a wing the one below the wing."""
-    parts = name.split(".")
-    return ".".join(parts[1 : 3 if ".".join(parts[:2]) in WINGS else 2])
 
 
 def test_every_module_is_in_a_room_of_the_table() -> None:
@@ -107,6 +100,14 @@ def test_doors_offer_what_they_say() -> None:
     for name in doors:
         door = import_module(name)
         assert door.__all__ and all(hasattr(door, offered) for offered in door.__all__), name
+
+
+def test_the_rooms_that_import_a_room() -> None:
+    assert {"refinement", "detection", "tracking"} <= set(rooms_with("refinement"))
+    assert "calibration" not in rooms_with("tracking")
+    assert [path.name for path in folders("station.studio")] == ["cli", "studio"]
+    with pytest.raises(KeyError):
+        rooms_with("lobby")
 
 
 def test_no_room_imports_the_front() -> None:
