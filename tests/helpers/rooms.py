@@ -14,6 +14,39 @@ WINGS = {"arview.station", "arview.quality"}
 """Packages of rooms. They hold no code themselves."""
 
 
+ROOMS = (
+    ("errors",),
+    ("version",),
+    ("geometry",),
+    ("pose",),
+    ("core",),
+    ("camera",),
+    ("cad",),
+    ("rendering", "fiducials", "weights", "web"),
+    ("guideviews",),
+    ("refinement",),
+    ("detection",),
+    ("assembly",),
+    ("tracking",),
+    ("video", "inspection"),
+    ("overlay",),
+    ("pose_file",),
+    ("annotation",),
+    ("reconstruction",),
+    ("measurement",),
+    ("quality.rework", "quality.decisions"),
+    ("report", "quality.history", "calibration", "acceptance"),
+    ("workflow",),
+    ("quality.batch", "station.capture"),
+    ("station.walk",),
+    ("station.live",),
+    ("station.studio",),
+    ("cli",),
+)
+"""From the bottom up. A room imports only rooms of lines above its own; rooms on one line do not import each other."""
+LEVEL = {room: level for level, line in enumerate(ROOMS) for room in line}
+
+
 def room(name: str) -> str:
     """The room of a module: the folder or module below `arview`, in a wing the one below the wing."""
     parts = name.split(".")

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
-import arview.measurement.folder
-import arview.measurement.run
+import arview.measurement
+import arview.reconstruction
 import arview.workflow.run
 from arview.cli import ExitCode, main
 from arview.cli.exit_codes import exit_code_of
@@ -45,9 +45,9 @@ class Bench:
         (folder / "photos").mkdir()
         for i in range(4):
             (folder / "photos" / f"{i}.jpg").write_bytes(bytes([i]) * 100)
-        patch.setattr(arview.workflow.run, "reconstruct", self.reconstruct)
-        patch.setattr(arview.measurement.run, "measure", self.measure)
-        patch.setattr(arview.measurement.folder, "read_folder", lambda folder: None)
+        patch.setattr(arview.reconstruction, "reconstruct", self.reconstruct)
+        patch.setattr(arview.measurement, "measure", self.measure)
+        patch.setattr(arview.measurement, "read_folder", lambda folder: None)
         patch.setattr(arview.workflow.run, "with_halves", lambda found, *others: found)
         patch.setattr(arview.workflow.run, "make_film", self.film)
 

@@ -20,10 +20,10 @@ if TYPE_CHECKING:
     from arview.inspection.details import Repeatability as Repeatability
     from arview.inspection.details import Vector3 as Vector3
     from arview.inspection.document import from_document as from_document
-    from arview.inspection.export.csv_table import to_csv as to_csv
-    from arview.inspection.export.dfq import to_dfq as to_dfq
-    from arview.inspection.export.glb import to_glb as to_glb
-    from arview.inspection.export.qif import to_qif as to_qif
+    from arview.inspection.export import to_csv as to_csv
+    from arview.inspection.export import to_dfq as to_dfq
+    from arview.inspection.export import to_glb as to_glb
+    from arview.inspection.export import to_qif as to_qif
     from arview.inspection.files import load_inspection as load_inspection
     from arview.inspection.files import save_inspection as save_inspection
     from arview.inspection.fingerprint import component_fingerprint as component_fingerprint
@@ -64,10 +64,12 @@ __getattr__, __dir__, __all__ = lazy_door(
             "Vector3",
         ),
         "document": ("from_document",),
-        "export.csv_table": ("to_csv",),
-        "export.dfq": ("to_dfq",),
-        "export.glb": ("to_glb",),
-        "export.qif": ("to_qif",),
+        "export": (
+            "to_csv",
+            "to_dfq",
+            "to_glb",
+            "to_qif",
+        ),
         "files": (
             "load_inspection",
             "save_inspection",

@@ -29,7 +29,7 @@ from arview.pose import Pose, TrackingState
 from arview.station.live.options import RecordingOptions
 from arview.station.live.protocol import NOTICE_CODES
 from arview.station.live.stream import recording
-from arview.station.live.stream.annotator import FrameAnnotator
+from arview.station.live.stream.annotator import KEPT_STYLES, FrameAnnotator
 from arview.station.live.stream.documents import _source_name, pose_document
 from arview.station.live.stream.feed import KEPT_FRAMES, Feed, TrackedFrame
 from arview.station.live.stream.frames import DecodedFrame, IncomingFrame
@@ -283,7 +283,7 @@ def test_a_frame_is_drawn_once_for_each_style() -> None:
     for opacity in (0.1, 0.2, 0.3, 0.4, 0.5, 0.6):
         annotator.style = replace(annotator.style, opacity=opacity)
         annotator.draw(one)
-    assert len(annotator._renderers) == subject.options.feed.kept_styles
+    assert len(annotator._renderers) == KEPT_STYLES
     overlays = subject.overlays
     subject.revision += 1  # another inspection
     annotator.draw(tracked_frame(1))

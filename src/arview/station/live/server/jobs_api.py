@@ -84,7 +84,7 @@ class JobHandlers:
             Route(f"{job}/sign", self.sign, methods=["POST"]),
             Route(f"{job}/report.html", self.report),
             Route(f"{job}/inspection.json", self.inspection),
-            Route(f"{job}/quality.csv", self.decisions),
+            Route(f"{job}/decisions.csv", self.decisions),
             Route(f"{job}/photos/{{name:path}}", self.photo),
             Route(f"{job}/rework/{{component}}.svg", self.drawing),
             Route(f"{job}/rework/{{picture:path}}", self.picture),
