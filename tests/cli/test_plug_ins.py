@@ -10,9 +10,11 @@ import sys
 from importlib.metadata import EntryPoint
 from pathlib import Path
 
+import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
+import arview
 from arview.cli import main
 from arview.core.plug_ins import find_plug_ins, load_plug_in
 from arview.errors import InputError
@@ -119,15 +121,65 @@ def test_the_first_of_two_packages_has_the_name(monkeypatch: pytest.MonkeyPatch)
         load_plug_in(find_plug_ins(GROUP)["hello"])
 
 
+def page_files() -> dict[str, str]:
+    """The files that the page shows, by name."""
+    page = (ROOT / "docs" / "reference" / "plug-ins.md").read_text(encoding="utf-8")
+    return dict(re.findall(r"^```\w+ title=\"([^\"]+)\"\n(.*?)^```$", page, re.MULTILINE | re.DOTALL))
+
+
+@pytest.fixture
+def page_plug_ins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The reader, the source and the export of the page, as if their packages were installed."""
+    for name, text in page_files().items():
+        if name.endswith(".py"):
+            (tmp_path / name).write_text(text)
+            monkeypatch.delitem(sys.modules, name.removesuffix(".py"), raising=False)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    entries = {
+        "arview.readers": EntryPoint("blocks", "arview_blocks:read_blocks", "arview.readers"),
+        "arview.sources": EntryPoint("noise", "arview_noise:NoiseSource", "arview.sources"),
+        "arview.exports": EntryPoint("names", "arview_names:failed_names", "arview.exports"),
+    }
+    monkeypatch.setattr(importlib.metadata, "entry_points", lambda group: [entries[group]] if group in entries else [])
+
+
+def test_a_reader_of_another_package(page_plug_ins: None, tmp_path: Path) -> None:
+    path = tmp_path / "two.blocks"
+    path.write_text("plate 100 60 5 0 0 0\npost 10 10 40 20 0 22.5\n")
+    model = arview.load_model(path)
+    assert [one.name for one in model.components] == ["plate", "post"]
+    assert np.allclose(model.components[1].bounds_in_model, [[15, -5, 2.5], [25, 5, 42.5]])
+    path.write_text("plate 100 sixty 5 0 0 0\n")
+    with pytest.raises(InputError, match=r"two\.blocks: arview_blocks cannot read it \(ValueError: "):
+        arview.load_model(path)
+    with pytest.raises(InputError, match=r"CAD of type .bricks is not read"):
+        other = tmp_path / "two.bricks"
+        other.write_text("x")
+        arview.load_model(other)
+
+
+def test_a_source_of_another_package(page_plug_ins: None) -> None:
+    with arview.open_source("noise:3") as source:
+        frames = list(source)
+    assert [frame.index for frame in frames] == [0, 1, 2] and frames[0].image.shape == (48, 64, 3)
+
+
+def test_an_export_of_another_package(page_plug_ins: None, tmp_path: Path) -> None:
+    inspection = SAMPLES / "bracket_plate" / "inspection.json"
+    result = run("export", str(inspection), "--to", "names", "-o", str(tmp_path / "failed.txt"))
+    assert result.exit_code == 0, result.output
+    failed = [one.name for one in arview.load_inspection(inspection).components if one.verdict == "fail"]
+    assert failed and (tmp_path / "failed.txt").read_text().split() == failed
+    assert "expected some of csv" in run("export", str(inspection), "--to", "nomes").stderr
+
+
 @pytest.mark.slow
 def test_the_example_of_the_documentation_works(tmp_path: Path) -> None:
     pytest.importorskip("hatchling", reason="hatchling, of arview[dev], builds the example")
-    page = (ROOT / "docs" / "reference" / "plug-ins.md").read_text(encoding="utf-8")
-    files = re.findall(r"^```\w+ title=\"([^\"]+)\"\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)
-    assert [name for name, _ in files] == ["pyproject.toml", "arview_components.py"]
+    files = {name: page_files()[name] for name in ("pyproject.toml", "arview_components.py")}
     source, site = tmp_path / "source", tmp_path / "site"
     source.mkdir()
-    for name, text in files:
+    for name, text in files.items():
         (source / name).write_text(text)
     install = ["-m", "pip", "install", "--quiet", "--no-deps", "--no-build-isolation", "--target", site, source]
     subprocess.run([sys.executable, *map(str, install)], check=True)

@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -21,9 +22,15 @@ from arview.cad.formats.threemf import read_3mf
 from arview.cad.model import Component, Model, make_model
 from arview.cad.view_range import Up
 from arview.core.checks import PATH, check_type
+from arview.core.plug_ins import find_plug_ins, load_plug_in, package_of
 from arview.errors import InputError
 from arview.geometry import Array
 
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
+
+PLUG_INS = "arview.readers"
+"""Entry points of other packages, named by the suffix that each reads, without its dot."""
 SUFFIXES = (".step", ".stp", ".glb", ".gltf", ".obj", ".stl", ".ply", ".3mf")
 MIN_SIZE_MM, MAX_SIZE_MM = 1.0, 100_000.0
 """Range of the diameter of a part, for files whose unit may be wrong."""
@@ -95,7 +102,7 @@ def load_cad(
         raise InputError(f"{path}: no such file")
     if not path.is_file():
         raise InputError(f"{path}: is not a file")
-    if suffix not in SUFFIXES:
+    if suffix not in SUFFIXES and suffix[1:] not in find_plug_ins(PLUG_INS):
         raise InputError(f"{path}: CAD of type {suffix or '(none)'!s} is not read; give one of {' '.join(SUFFIXES)}")
     if unit is not None and unit not in UNIT_MM:
         raise InputError(f"unit {unit!r} is not known; give one of {', '.join(UNIT_MM)}")
@@ -166,7 +173,24 @@ def _read(path: Path, suffix: str, tol_linear_mm: float, tol_angular_deg: float,
         return read_3mf(path)
     if suffix == ".stl":
         return read_stl(path)
-    return _read_ply(path)
+    if suffix == ".ply":
+        return _read_ply(path)
+    return _read_by_plug_in(path, find_plug_ins(PLUG_INS)[suffix[1:]])
+
+
+def _read_by_plug_in(path: Path, entry: EntryPoint) -> RawModel:
+    """A file read by another package: pairs of a name and a `trimesh.Trimesh` in mm."""
+    read = load_plug_in(entry)
+    raw = RawModel(unit_mm=1.0)
+    try:
+        for name, mesh in read(path):
+            vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
+            raw.add(RawComponent((str(name),), vertices, faces), path)
+    except InputError:
+        raise
+    except Exception as error:  # another package's code
+        raise InputError(f"{path}: {package_of(entry)} cannot read it ({type(error).__name__}: {error})") from error
+    return raw
 
 
 def _read_ply(path: Path) -> RawModel:

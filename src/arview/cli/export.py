@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import click
@@ -11,16 +12,20 @@ from arview import acceptance
 from arview.cli.common import UNIT, main, output_path, say
 from arview.core.atomic import write_file
 from arview.core.extras import require
+from arview.core.plug_ins import find_plug_ins, load_plug_in
 from arview.errors import InputError, OutputError
 from arview.quality import decisions
 
+PLUG_INS = "arview.exports"
+"""Entry points of other packages, named as --to names them."""
 FORMATS = ("csv", "qif", "dfq", "glb", "html", "pdf", "decisions")
 
 
 def _parse_formats(ctx: click.Context, parameter: click.Parameter, value: str) -> tuple[str, ...]:
     names = tuple(dict.fromkeys(name.strip().lower() for name in value.split(",") if name.strip()))
-    if not names or any(name not in FORMATS for name in names):
-        raise click.BadParameter(f"{value!r}: expected some of {','.join(FORMATS)}")
+    known = (*FORMATS, *find_plug_ins(PLUG_INS))
+    if not names or any(name not in known for name in names):
+        raise click.BadParameter(f"{value!r}: expected some of {','.join(known)}")
     return names
 
 
@@ -100,6 +105,9 @@ def export(
     if part is not None:
         model = part.model
         made["glb"] = lambda: to_glb(loaded, model, sha256=sha256)
+    for name, entry in find_plug_ins(PLUG_INS).items():
+        if name in targets and name not in FORMATS:
+            made[name] = partial(load_plug_in(entry), loaded)
     for name, target in targets.items():
         if name in made:
             write_file(target, made[name]())

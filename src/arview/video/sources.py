@@ -7,6 +7,7 @@ import re
 from pathlib import Path
 
 from arview.core.checks import PATH, check_type
+from arview.core.plug_ins import find_plug_ins, load_plug_in
 from arview.errors import InputError, without_credentials
 from arview.video.files import VideoFileSource
 from arview.video.live import CameraGrabber, LiveSource, UrlGrabber
@@ -21,6 +22,8 @@ from arview.video.pictures import (
 from arview.video.source import FrameRange, FrameSource
 
 _CAMERA_INDEX = re.compile(r"(?:/dev/video)?([0-9]{1,3})")
+PLUG_INS = "arview.sources"
+"""Entry points of other packages, named by the scheme of the addresses that each opens."""
 _URL = re.compile(r"[a-zA-Z][a-zA-Z0-9+.-]+://")
 
 
@@ -37,7 +40,8 @@ def open_source(
     """Open a source of frames: video file, picture, folder, glob or pattern of pictures, camera index or URL.
 
     Args:
-        spec: path, glob ("shots/*.png"), pattern ("frame_%04d.png"), camera index ("0") or URL ("rtsp://…").
+        spec: path, glob ("shots/*.png"), pattern ("frame_%04d.png"), camera index ("0"), URL ("rtsp://…"), or an
+            address of another package's sources ("SCHEME:…").
         start: index of the first wanted frame in the source, of numbered pictures the number; None is 0.
         end: index of the first frame that is not wanted any more; None is the end of the source.
         stride: interval between wanted frames.
@@ -54,6 +58,12 @@ def open_source(
     if not 0 < fps < float("inf"):
         raise InputError(f"fps {fps}: expected a positive number of frames per second")
     path = Path(text.removeprefix("file://"))
+    scheme, _, address = text.partition(":")
+    if address and (entry := find_plug_ins(PLUG_INS).get(scheme)) is not None:
+        source = load_plug_in(entry)(address, wanted)
+        if not isinstance(source, FrameSource):
+            raise InputError(f"{text}: {entry.value} made no source of frames")
+        return source
     if _URL.match(text) and not text.startswith("file://"):
         return LiveSource(
             without_credentials(text),
