@@ -8,12 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from click.testing import CliRunner
 
 from arview.acceptance.comparison import compare
 from arview.acceptance.lengths import read_known, read_measured
 from arview.acceptance.position_list import ListedComponent, is_position_list, read_position_list
-from arview.cad.model import Model
+from arview.cad.model import Component, Model, make_model
 from arview.cad.part import ComponentSettings, Part
 from arview.cli import main
 from arview.errors import InputError
@@ -247,3 +248,56 @@ def test_the_command_compare(found: Inspection, tmp_path: Path) -> None:
     assert apart.exit_code == 1 and "differs" in apart.output
     absent = CliRunner().invoke(main, ["compare", str(tmp_path / "none.csv"), str(tmp_path)])
     assert absent.exit_code == 64 and "no such file" in absent.output
+
+
+def _boxes(name: str, *boxes: tuple[tuple[float, float, float], tuple[float, float, float]]) -> Component:
+    """A component of boxes by their sizes and middles, mm."""
+    meshes = [trimesh.creation.box(size, trimesh.transformations.translation_matrix(at)) for size, at in boxes]
+    mesh = trimesh.util.concatenate(meshes)
+    return Component(name, np.array(mesh.vertices), np.array(mesh.faces, dtype=np.int32))
+
+
+BRACKET = make_model(
+    "bracket",
+    (
+        _boxes("plate", ((100.0, 60.0, 5.0), (0.0, 0.0, -2.5))),
+        _boxes("bracket", ((40.0, 20.0, 4.0), (0.0, 0.0, 2.0)), ((4.0, 20.0, 36.0), (-18.0, 0.0, 22.0))),
+    ),
+)
+"""A plate, and an L whose centre of mass is more than 5 mm from the middle of its bounding box."""
+
+
+@pytest.mark.parametrize("point", ["part", "mass", "box"])
+def test_positions_are_of_one_stated_point(point: str, tmp_path: Path) -> None:
+    """The same displacement is found whichever point a machine states, if the list says which one it is."""
+    bracket = BRACKET.component("bracket")
+    middle, mass = bracket.bounds_in_model.mean(axis=0), bracket.centroid_in_model
+    assert np.linalg.norm(middle - mass) > 5.0
+    moved = np.array([0.3, -0.2, 0.1])
+    x, y, z = (middle if point == "box" else mass) + moved
+    path = tmp_path / "cmm.csv"
+    path.write_text(f"name,measurand,x,y,z,U\nbracket,{point},{x:.4f},{y:.4f},{z:.4f},0.01\n")
+    settings = (ComponentSettings("plate", "base"), ComponentSettings("bracket", "inspect", 0.5))
+    part = Part("bracket", Path("part.toml"), Path("bracket.glb"), BRACKET, settings)
+    listed = read_position_list(path)
+    (made,) = [one for one in new_inspection(part, listed, None, "cmm.csv").components if one.name == "bracket"]
+    assert np.allclose([value or 0.0 for value in made.displacement_mm], moved, atol=1e-3)
+    assert made.details is not None
+    assert made.details.measurand == ("box_center" if point == "box" else "volume_centroid")
+    ours = inspection(BRACKET, (deviation("bracket", tuple(moved), mass),))
+    ours = replace(
+        ours,
+        components=tuple(replace(c, details=replace(c.details, measurand="volume_centroid")) for c in ours.components),
+    )
+    (compared,) = compare(ours, listed, "cmm.csv", BRACKET).components
+    assert compared.distance_mm < 1e-3
+    if point == "box":
+        with pytest.raises(InputError, match="nominal position of the listed point; give --part"):
+            compare(ours, listed, "cmm.csv")
+
+
+def test_a_point_that_is_not_known_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "cmm.csv"
+    path.write_text("name,measurand,x,y,z,U\nbracket,corner,1,2,3,0.01\n")
+    with pytest.raises(InputError, match="line 2: 'corner' is no point; expected part, mass, box"):
+        read_position_list(path)

@@ -97,7 +97,7 @@ def compare(
             left_out[line.name] = "the inspection has no such component"
             continue
         named.add(one.name)
-        compared = _compare(one, line, _center_of(one, model))
+        compared = _compare(one, line, _center_of(one, model, line.point))
         if isinstance(compared, str):
             left_out[one.name] = compared
         else:
@@ -136,7 +136,7 @@ def _compare(one: ComponentDeviation, line: ListedComponent, center: Array | Non
     theirs = line.displacement
     if np.isnan(theirs).all():
         if center is None:
-            return "the inspection has no nominal positions to compare x, y, z with; give --part, or list dx, dy, dz"
+            return "the inspection has no nominal position of the listed point; give --part, or list dx, dy, dz"
         theirs = line.place - center
     ours = np.array([np.nan if value is None else value for value in one.displacement_mm])
     difference = ours - theirs
@@ -161,8 +161,13 @@ def _compare(one: ComponentDeviation, line: ListedComponent, center: Array | Non
     )
 
 
-def _center_of(one: ComponentDeviation, model: Model | None) -> Array | None:
-    """(3,) nominal position of the point that the inspection states, mm, or None."""
+def _center_of(one: ComponentDeviation, model: Model | None, point: str) -> Array | None:
+    """(3,) nominal position of the point that a list states: the inspection's own or a named one, mm, or None."""
+    stated = None if one.details is None else one.details.measurand
+    if point == "mass" and stated not in ("volume_centroid", "area_centroid"):
+        return None if model is None else model.component(one.name).centroid_in_model
+    if point == "box" and stated != "box_center":
+        return None if model is None else np.asarray(model.component(one.name).bounds_in_model.mean(axis=0))
     if one.details is not None:
         return np.array(one.details.center_mm)
     return None if model is None else np.asarray(model.component(one.name).bounds_in_model.mean(axis=0))

@@ -30,6 +30,8 @@ _NAMES = frozenset(
         "punkt",
     }
 )
+POINTS = ("part", "mass", "box")
+"""Points of a component that a list may state: that of the part file, centre of mass, middle of the bounding box."""
 _UNITS = ("mm", "millimeter", "millimetre")
 _EXPECTED = "name with x, y, z or dx, dy, dz, and optionally U"
 
@@ -40,15 +42,17 @@ class ListedComponent:
 
     Attributes:
         name: of the component.
-        place: (3,) measured position of its centre, mm, NaN where it is not stated.
+        place: (3,) measured position of its point, mm, NaN where it is not stated.
         displacement: (3,) measured minus nominal position, mm, NaN where it is not stated.
         uncertainty: (3,) expanded uncertainty (k = 2) along x, y, z, mm; None when it is not stated.
+        point: of `POINTS`, the one that x, y, z are the position of.
     """
 
     name: str
     place: Array
     displacement: Array
     uncertainty: Array | None
+    point: str = "part"
 
 
 def is_position_list(path: str | Path) -> bool:
@@ -63,10 +67,12 @@ def is_position_list(path: str | Path) -> bool:
 def read_position_list(path: str | Path) -> tuple[ListedComponent, ...]:
     """Read a list with the columns name, x, y, z (positions) or dx, dy, dz (deviations), and U or Ux, Uy, Uz (k = 2).
 
-    The columns may have units in brackets and other common names (component, feature, actual x, deviation x, …).
+    The columns may have units in brackets and other common names (component, feature, actual x, deviation x, …). A
+    column ``measurand`` says of which point x, y, z are the position, see `POINTS`; without it that of the part file.
 
     Raises:
-        InputError: the file cannot be read, has no such columns, another unit than mm, a name twice, or no line.
+        InputError: the file cannot be read, has no such columns, another unit than mm, a name twice, an unknown point,
+            or no line.
     """
     table = read_table(path, _is_header, _EXPECTED)
     columns = _columns(table.columns)
@@ -81,7 +87,10 @@ def read_position_list(path: str | Path) -> tuple[ListedComponent, ...]:
             raise InputError(f"{table.path}: line {line}: the name is empty")
         if name in found:
             raise InputError(f"{table.path}: line {line}: {name!r} is listed twice")
-        found[name] = ListedComponent(name, *_values(table, columns, line, row.__getitem__))
+        point = row[columns["measurand"]].lower() if "measurand" in columns else ""
+        if point and point not in POINTS:
+            raise InputError(f"{table.path}: line {line}: {point!r} is no point; expected {', '.join(POINTS)}")
+        found[name] = ListedComponent(name, *_values(table, columns, line, row.__getitem__), point or "part")
     if not found:
         raise InputError(f"{table.path}: lists no component")
     return tuple(found.values())
@@ -128,6 +137,8 @@ def _key(column: str) -> str | None:
     joined = "".join(words)
     if joined in _NAMES:
         return "name"
+    if joined == "measurand":
+        return joined
     if joined in ("u", "u95", "uncertainty", "expandeduncertainty", "unsicherheit", "messunsicherheit"):
         return "u"
     for axis in "xyz":

@@ -161,9 +161,10 @@ Examples:
 \b
 Without --values every component is not_measured, to be filled in by hand; a mistake is named with its
 place when the file is read. VALUES is a list of measured components, as a measuring machine writes it:
-columns name and dx, dy, dz (measured minus nominal) or x, y, z (centre of the bounding box, in the
-frame of the CAD's datums), and U (k = 2), in mm, separated by ; or , or tabs, with decimal point or
-comma. Verdicts follow ISO 14253-1 from U and the tolerances of the part file.""",
+columns name and dx, dy, dz (measured minus nominal) or x, y, z (position in the frame of the CAD's
+datums), and U (k = 2), in mm, separated by ; or , or tabs, with decimal point or comma. x, y, z are of
+the point that the part file names, else of the centre of mass; a column measurand (mass or box) says
+that they are of another one. Verdicts follow ISO 14253-1 from U and the tolerances of the part file.""",
 )
 @click.argument("part")
 @click.option("-o", "--output", metavar="JSON", default="inspection.json", show_default=True, help="File to write.")

@@ -53,8 +53,12 @@ def new_inspection(
 def _component(part: Part, name: str, value: acceptance.ListedComponent | None, label: str) -> ComponentDeviation:
     tolerance_mm = part.component_settings(name).position_tolerance_mm
     measurand = measurement.measurand_of(name, part)
-    center = measurand.point_in_model
-    details = Details((float(center[0]), float(center[1]), float(center[2])), measurand.kind)
+    center, kind = measurand.point_in_model, measurand.kind
+    if value is not None and value.point != "part":
+        component = part.model.component(name)
+        center = component.centroid_in_model if value.point == "mass" else component.bounds_in_model.mean(axis=0)
+        kind = ("volume_centroid" if component.is_solid else "area_centroid") if value.point == "mass" else "box_center"
+    details = Details((float(center[0]), float(center[1]), float(center[2])), kind)
     moved = np.full(3, np.nan)
     if value is not None:
         moved = value.place - center if np.isnan(value.displacement).all() else value.displacement
