@@ -22,7 +22,7 @@ SHARP_COLOR = (215, 35, 30)
 EDGE_COLOR = (60, 110, 235)
 PLAIN_COLOR = (190, 120, 0)
 CONFUSABLE_COLOR = (150, 30, 140)
-"""Direction towards the light, over the viewer's left shoulder."""
+"""RGB of a view that may be confused with another one."""
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 

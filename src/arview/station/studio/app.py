@@ -124,11 +124,11 @@ class StudioHandlers:
 
     async def index(self, request: Request) -> Response:
         """The page."""
-        return self._file("index.html")
+        return live.static_response(self._files, "index.html")
 
     async def static(self, request: Request) -> Response:
         """A static file of the page."""
-        return self._file(request.path_params["name"])
+        return live.static_response(self._files, request.path_params["name"])
 
     async def part(self, request: Request) -> Response:
         """The part."""
@@ -237,9 +237,6 @@ class StudioHandlers:
     async def _changed(self, work: Callable[[], object]) -> Response:
         await asyncio.to_thread(work)
         return JSONResponse(self._document.describe())
-
-    def _file(self, name: str) -> Response:
-        return live.static_response(self._files, name)
 
 
 async def _told(request: Request, error: Exception) -> Response:

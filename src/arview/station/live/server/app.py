@@ -10,7 +10,6 @@ import time
 from collections.abc import Awaitable, Callable, Mapping
 from importlib import resources
 from importlib.resources.abc import Traversable
-from typing import Any
 
 from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
@@ -144,7 +143,7 @@ class Handlers:
     async def join(self, request: Request) -> Response:
         """Add a client."""
         self._joins.check(request.client.host if request.client else "?")
-        wanted = await self._json_body(request, OFFER_BYTES)
+        wanted = await json_body(request, OFFER_BYTES, BODY_TIMEOUT_S)
         client, answer = await self._hub.join(wanted, request.scope.get(DEVICE))
         described = None if answer is None else {"type": "answer", "sdp": answer}
         return _json_response({"client": client.name, "answer": described}, 201)
@@ -158,7 +157,7 @@ class Handlers:
     async def control(self, request: Request) -> Response:
         """Carry out a *Control* request and return the *Status*."""
         client = self._client(request)
-        await self._hub.control(client, await self._json_body(request, CONTROL_BYTES))
+        await self._hub.control(client, await json_body(request, CONTROL_BYTES, BODY_TIMEOUT_S))
         return _json_response(self._hub.status(client))
 
     async def take_frame(self, request: Request) -> Response:
@@ -244,9 +243,6 @@ class Handlers:
                 return tracked
         except TimeoutError as error:
             raise Refusal(503, "busy", "the tracking took too long; send the next picture") from error
-
-    async def _json_body(self, request: Request, max_bytes: int) -> dict[str, Any]:
-        return await json_body(request, max_bytes, BODY_TIMEOUT_S)
 
     def _client(self, request: Request) -> Client:
         return self._hub.client(request.path_params["client"])
