@@ -140,6 +140,7 @@ def test_a_cloud_makes_room_at_once_and_comes_last(part: Part, tmp_path: Path, m
     measured(other)
     workers.processes[other.id].kill()
     workers.tick_until(lambda: workers.started == [cloud.id, other.id, cloud.id])
+    assert workers.started.count(cloud.id) == 2 and workers.started[-1] == cloud.id
 
 
 def test_one_that_breaks_is_started_again_a_few_times(

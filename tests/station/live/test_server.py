@@ -351,7 +351,9 @@ def test_silent_pages_leave_by_themselves(monkeypatch: pytest.MonkeyPatch) -> No
     with running(chosen, loader(chosen)) as server:
         page = server.session()
         page.join()
+        joined = len(server.hub.clients)
         wait(lambda: not server.hub.clients)
+        assert joined == 1
 
 
 @pytest.mark.slow

@@ -238,12 +238,16 @@ def test_recording_of_a_station_from_the_start(clip: Path, tmp_path: Path) -> No
 @pytest.mark.parametrize("spec", ["no_such_file.mp4", "shots/*.jpg"])
 def test_a_source_that_cannot_be_is_refused_at_once(spec: str) -> None:
     with pytest.raises(InputError):
-        check_source(spec)
+        assert check_source(spec) is None
+    with pytest.raises(InputError):
+        check_source("/nowhere/clip.mp4")
 
 
 @pytest.mark.parametrize("spec", ["0", "/dev/video7", "rtsp://127.0.0.1:9/1"])
 def test_a_camera_need_not_be_there_yet(spec: str) -> None:
-    check_source(spec)
+    assert check_source(spec) is None
+    with pytest.raises(InputError):
+        check_source("/nowhere/clip.mp4")
 
 
 @pytest.mark.parametrize(
