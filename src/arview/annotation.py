@@ -14,14 +14,14 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Generic, Protocol, TypeVar
+from typing import Protocol
 
 from arview.camera import Camera
 from arview.core.checks import check_type
 from arview.errors import OutputError, is_interruption
 from arview.pose import Completeness, Pose, Presence
 from arview.pose_file import PoseWriter
-from arview.tracking import FocalEstimate, SelfCalibratingSession
+from arview.tracking import FocalEstimate, TrackingSession
 from arview.video import Frame, FrameSource, Image
 
 MAX_FIRST_PASS = 900
@@ -38,23 +38,18 @@ FPS_WINDOW_S = 1.0
 _NUMBER = re.compile(r"-?\d+(?:\.\d+)?")
 
 
-Result = TypeVar("Result", Pose, tuple[Pose, ...])
-ResultOut = TypeVar("ResultOut", Pose, tuple[Pose, ...], covariant=True)
-ResultIn = TypeVar("ResultIn", Pose, tuple[Pose, ...], contravariant=True)
+class Session(Protocol):
+    """What tracks: `arview.tracking.TrackingSession`."""
 
-
-class Session(Protocol[ResultOut]):
-    """What tracks: `arview.tracking.TrackingSession`, or `arview.tracking.several.sessions.SeveralSessions`."""
-
-    def process(self, image: Image, index: int, time_s: float) -> ResultOut:
-        """Pose of the next frame, or poses of all specimens in it."""
+    def process(self, image: Image, index: int, time_s: float) -> tuple[Pose, ...]:
+        """Pose of each specimen in the next frame."""
         ...
 
 
-class Overlay(Protocol[ResultIn]):
-    """What draws: `arview.overlay.OverlayRenderer`, or `arview.overlay.several.SeveralOverlay`."""
+class Overlay(Protocol):
+    """What draws: `arview.overlay.OverlayRenderer`, or `FollowingOverlay`."""
 
-    def draw(self, image: Image, pose: ResultIn, fps: float | None = None) -> Image:
+    def draw(self, image: Image, poses: tuple[Pose, ...], /, fps: float | None = None) -> Image:
         """The annotated frame."""
         ...
 
@@ -132,8 +127,8 @@ class AnnotateSummary:
 
 def annotate(
     source: FrameSource,
-    session: Session[Result],
-    overlay: Overlay[Result] | None = None,
+    session: Session,
+    overlay: Overlay | None = None,
     sink: Sink | None = None,
     poses_path: str | Path | None = None,
     *,
@@ -149,8 +144,8 @@ def annotate(
 
     Args:
         source: of the frames.
-        session: tracks one part, or several.
-        overlay: draws what the session returns; required with a sink.
+        session: tracks the specimens.
+        overlay: draws them; required with a sink.
         sink: writes the annotated frames; it is closed (or aborted) here.
         poses_path: file for one JSON line per frame and specimen, see `PoseWriter`.
         progress: called after each frame with (frames done, pose of the first specimen).
@@ -166,7 +161,7 @@ def annotate(
     if sink is not None and overlay is None:
         raise ValueError("annotate: a sink needs an overlay")
     counts = _Counts()
-    outputs: _OutputFiles[Result] = _OutputFiles(sink)
+    outputs = _OutputFiles(sink)
     began = time.perf_counter()
     try:
         outputs.open(overlay, poses_path, camera_of)
@@ -176,9 +171,8 @@ def annotate(
                     continue
                 if end_s is not None and frame.time_s >= end_s:
                     break
-                result = session.process(frame.image, frame.index, frame.time_s)
-                poses = (result,) if isinstance(result, Pose) else result
-                outputs.write(frame, result, poses)
+                poses = session.process(frame.image, frame.index, frame.time_s)
+                outputs.write(frame, poses)
                 counts.add(poses)
                 if progress:
                     progress(len(counts.ms), poses[0])
@@ -197,27 +191,33 @@ def annotate(
 
 
 def estimate_camera(
-    source: FrameSource, session: SelfCalibratingSession, progress: Callable[[int], None] | None = None
+    source: FrameSource, session: TrackingSession, progress: Callable[[int], None] | None = None
 ) -> FocalEstimate:
     """The focal length from a first pass over a film, which ends as soon as it is known well.
 
     Args:
         source: of the frames; it must start again with each iteration.
-        session: a new one; it is finished here.
+        session: a new one whose camera is a guess; it is finished here.
         progress: called with the number of frames done.
+
+    Raises:
+        ValueError: the camera of the session is no guess.
     """
+    estimate = session.camera_estimate
+    if estimate is None:
+        raise ValueError("estimate_camera: the camera of the session is no guess")
     kept = idle = 0
     for done, frame in enumerate(source, 1):
         session.process(frame.image, frame.index, frame.time_s)
         # A film gives the same result each time; a stream does not wait.
-        session.wait()
+        estimate.wait()
         if progress:
             progress(done)
-        idle = 0 if session.frames > kept else idle + 1
-        kept = session.frames
-        if session.is_done or done >= MAX_FIRST_PASS or idle >= MAX_IDLE_FRAMES:
+        idle = 0 if estimate.frames > kept else idle + 1
+        kept = estimate.frames
+        if estimate.is_done or done >= MAX_FIRST_PASS or idle >= MAX_IDLE_FRAMES:
             break
-    return session.finish()
+    return estimate.finish()
 
 
 class _Counts:
@@ -296,16 +296,16 @@ class _SpecimenCounts:
         return SpecimenSummary(dict(self._states), completeness, presence, self._serial)
 
 
-class _OutputFiles(Generic[Result]):
+class _OutputFiles:
     """The files of one run: the annotated video and the poses, each or none."""
 
     def __init__(self, sink: Sink | None) -> None:
         self._sink = sink
-        self._drawer: _Drawer[Result] | None = None
+        self._drawer: _Drawer | None = None
         self._poses: PoseWriter | None = None
 
     def open(
-        self, overlay: Overlay[Result] | None, poses_path: str | Path | None, camera_of: Callable[[int], Camera] | None
+        self, overlay: Overlay | None, poses_path: str | Path | None, camera_of: Callable[[int], Camera] | None
     ) -> None:
         """Open the file of the poses and start drawing."""
         if poses_path is not None:
@@ -313,10 +313,10 @@ class _OutputFiles(Generic[Result]):
         if self._sink is not None and overlay is not None:
             self._drawer = _Drawer(overlay, self._sink)
 
-    def write(self, frame: Frame, result: Result, poses: tuple[Pose, ...]) -> None:
-        """Add a frame to both files: what the session returned, which holds some poses."""
+    def write(self, frame: Frame, poses: tuple[Pose, ...]) -> None:
+        """Add a frame to both files."""
         if self._drawer is not None:
-            self._drawer.put(frame, result)
+            self._drawer.put(frame, poses)
         if self._poses is not None:
             for pose in poses:
                 self._poses.write(pose, frame.file)
@@ -406,23 +406,23 @@ def _listed(states: Mapping[str, int]) -> str:
     return ", ".join(f"{count} {state}" for state, count in sorted(states.items()))
 
 
-class _Drawer(Generic[Result]):
+class _Drawer:
     """A thread that draws frames in order and hands them to the sink."""
 
-    def __init__(self, overlay: Overlay[Result], sink: Sink) -> None:
-        self._overlay: Overlay[Result] = overlay
+    def __init__(self, overlay: Overlay, sink: Sink) -> None:
+        self._overlay = overlay
         self._sink = sink
-        self._waiting: queue.Queue[tuple[Frame, Result] | None] = queue.Queue(QUEUED_FRAMES)
+        self._waiting: queue.Queue[tuple[Frame, tuple[Pose, ...]] | None] = queue.Queue(QUEUED_FRAMES)
         self._error: BaseException | None = None
         self._is_stopped = False
         self._thread = threading.Thread(target=self._run, name="arview-overlay", daemon=True)
         self._thread.start()
 
-    def put(self, frame: Frame, result: Result) -> None:
+    def put(self, frame: Frame, poses: tuple[Pose, ...]) -> None:
         """Queue a frame; raises the exception of an earlier one, if drawing or writing it failed."""
         if self._error is not None:
             raise self._error
-        self._waiting.put((frame, result))
+        self._waiting.put((frame, poses))
 
     def finish(self) -> None:
         """Wait until all queued frames are written; raises the exception of one that failed."""
@@ -440,12 +440,12 @@ class _Drawer(Generic[Result]):
 
     def _run(self) -> None:
         rate = _Rate()
-        for frame, result in iter(self._waiting.get, None):
+        for frame, poses in iter(self._waiting.get, None):
             # After an error the queue is still emptied, so that no caller waits for room in it.
             if self._error is not None or self._is_stopped:
                 continue
             try:
-                self._sink.write(self._overlay.draw(frame.image, result, fps=rate.tick()), frame.time_s)
+                self._sink.write(self._overlay.draw(frame.image, poses, fps=rate.tick()), frame.time_s)
             except BaseException as error:
                 self._error = error
 
@@ -468,7 +468,7 @@ class _Rate:
         return self._fps
 
 
-class FollowingOverlay(Generic[Result]):
+class FollowingOverlay:
     """Draws with the camera of each frame, where that is replaced while the frames are tracked.
 
     Args:
@@ -476,15 +476,15 @@ class FollowingOverlay(Generic[Result]):
         camera_of: camera of the frame of an index.
     """
 
-    def __init__(self, make: Callable[[Camera], Overlay[Result]], camera_of: Callable[[int], Camera]) -> None:
-        self._make: Callable[[Camera], Overlay[Result]] = make
+    def __init__(self, make: Callable[[Camera], Overlay], camera_of: Callable[[int], Camera]) -> None:
+        self._make = make
         self._camera_of = camera_of
         self._camera: Camera | None = None
-        self._overlay: Overlay[Result] | None = None
+        self._overlay: Overlay | None = None
 
-    def draw(self, image: Image, pose: Result, fps: float | None = None) -> Image:
+    def draw(self, image: Image, poses: tuple[Pose, ...], /, fps: float | None = None) -> Image:
         """The annotated frame."""
-        camera = self._camera_of(pose.index if isinstance(pose, Pose) else pose[0].index)
+        camera = self._camera_of(poses[0].index)
         if self._overlay is None or camera is not self._camera:
             self._camera, self._overlay = camera, self._make(camera)
-        return self._overlay.draw(image, pose, fps=fps)
+        return self._overlay.draw(image, poses, fps=fps)

@@ -7,6 +7,7 @@ import json
 import pkgutil
 import subprocess
 import sys
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -69,7 +70,8 @@ def test_type_checkers_see_the_names() -> None:
     [
         ("Detector", ["views", "camera", "options"]),
         ("Tracker", ["views", "camera", "model", "options"]),
-        ("TrackingSession", ["views", "camera", "model", "options"]),
+        ("TrackingSession", ["parts", "camera", "options"]),
+        ("TrackingSession.of", ["views", "camera", "model", "options"]),
         ("OverlayRenderer", ["model", "camera", "inspection", "options"]),
         ("make_guide_views", ["model", "view_range", "options"]),
         ("load_part", ["path", "unit"]),
@@ -87,7 +89,7 @@ def test_type_checkers_see_the_names() -> None:
     ],
 )
 def test_order_of_arguments(name: str, arguments: list[str]) -> None:
-    parameters = inspect.signature(getattr(arview, name)).parameters.values()
+    parameters = inspect.signature(attrgetter(name)(arview)).parameters.values()
     assert [one.name for one in parameters if one.kind is one.POSITIONAL_OR_KEYWORD] == arguments
 
 
@@ -99,7 +101,7 @@ def test_errors_name_what_was_passed() -> None:
         (lambda: arview.load_part(5), r"^load_part: path: expected str or Path, got int \(5\)$"),
         (lambda: arview.load_camera(None), r"^load_camera: spec: expected str or Path, got None$"),
         (lambda: arview.Detector(camera, camera), r"^Detector: views: expected GuideViewSet, got Camera$"),
-        (lambda: arview.TrackingSession(camera, camera, None), r"^TrackingSession: views: expected GuideViewSet"),
+        (lambda: arview.TrackingSession.of(camera, camera, None), r"^TrackingSession: views: expected GuideViewSet"),
         (lambda: arview.OverlayRenderer(camera, camera), r"^OverlayRenderer: model: expected Model, got Camera$"),
         (lambda: arview.make_guide_views("part.step", None), r"^make_guide_views: model: expected Model, got str"),
         (lambda: arview.measure(7, None), r"^measure: reconstruction: expected MetricReconstruction or str or Path"),

@@ -13,7 +13,7 @@ from arview.assembly.monitor import OPEN_FRAMES, SUSPECT_FRAMES, AssemblyMonitor
 from arview.assembly.observation import Observation
 from arview.cad.model import Model
 from arview.geometry import Array, apply
-from arview.tracking import TrackingSession
+from arview.tracking import SpecimenTracking
 from helpers.synthetic import CAMERA, assembly, assembly_views, block, path, picture, pose_from, wrong
 from helpers.synthetic import changed as changed_from
 
@@ -289,7 +289,7 @@ def test_a_part_of_one_component_has_nothing_to_mismatch() -> None:
 
 @pytest.mark.slow
 def test_a_session_never_calls_a_similar_part_tracked() -> None:
-    session = TrackingSession(assembly_views(), CAMERA, assembly(), initial_cam_from_model=path(1, 4)[0])
+    session = SpecimenTracking(assembly_views(), CAMERA, assembly(), initial_cam_from_model=path(1, 4)[0])
     for k, pose in enumerate(path(5, 4)):
         result = session.process(picture(pose, changed(post_1=None), seed=k, scene=4, noise=4.0), k, k / 30)
         if k >= 1:

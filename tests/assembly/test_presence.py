@@ -14,7 +14,7 @@ from arview.assembly.observation import base_of
 from arview.cad.model import Model
 from arview.geometry import Array, apply, exp_se3
 from arview.pose import Completeness, ComponentPresence, Presence, Visibility
-from arview.tracking import TrackingSession
+from arview.tracking import SpecimenTracking
 from helpers.synthetic import CAMERA, assembly, assembly_views, block, path, picture, pose_from, wrong
 from helpers.synthetic import changed as changed_from
 
@@ -163,7 +163,7 @@ def test_a_part_of_one_component_has_no_presences() -> None:
 def test_a_session_follows_a_part_of_which_most_is_absent() -> None:
     absent = ("post_1", "post_2", "block_1", "rail")
     model = changed(**dict.fromkeys(absent))
-    session = TrackingSession(assembly_views(), CAMERA, assembly(), initial_cam_from_model=path(1, 4)[0])
+    session = SpecimenTracking(assembly_views(), CAMERA, assembly(), initial_cam_from_model=path(1, 4)[0])
     for k, pose in enumerate(path(24, 4)):
         result = session.process(picture(pose, model, seed=k, scene=4, noise=4.0), k, k / 30)
         assert result.cam_from_model is not None, f"frame {k}: {result.reason}"

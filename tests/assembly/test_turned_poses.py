@@ -17,7 +17,7 @@ from arview.geometry import Array, apply, exp_so3, rigid
 from arview.guideviews import GuideViewOptions
 from arview.guideviews.cache import cached_guide_views
 from arview.pose import Presence
-from arview.tracking import TrackingSession
+from arview.tracking import SpecimenTracking
 from helpers.cad_files import box
 from helpers.synthetic import CAMERA, assembly, assembly_views, changed, component, picture, pose_from, wrong
 
@@ -155,7 +155,7 @@ def test_a_session_started_turned_turns_back() -> None:
     model = changed(assembly(), **dict.fromkeys(name for name in NAMES if name not in left))
     poses = [pose_from(-40 + 3 * k, 45, 520) for k in range(20)]
     start = wrong(poses[0] @ upright_turn(), np.random.default_rng(0), 0.3, 0.5)
-    session = TrackingSession(assembly_views(), CAMERA, assembly(), initial_cam_from_model=start)
+    session = SpecimenTracking(assembly_views(), CAMERA, assembly(), initial_cam_from_model=start)
     for k, pose in enumerate(poses):
         result = session.process(picture(pose, model, seed=k, scene=3, noise=3.0), k, k / 30)
         assert not any(result.components[name].presence is Presence.MISSING for name in left if result.components)

@@ -15,7 +15,7 @@ import pytest
 
 from arview.station.live.options import JobOptions
 from arview.station.live.server.loading import load_subjects
-from arview.station.live.stream.subject import Subject
+from arview.station.live.stream.subjects import Subjects
 from helpers import live_browser
 from helpers.inspection_loop import COMPONENT, PLATE, Inspector, WalkSession, camera_script, first_walk, second_walk
 from helpers.live_client import running
@@ -33,10 +33,10 @@ def test_whole_inspection(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
     first, second = first_walk(range(0, 24, 2), WIDTH_PX), second_walk((0, 1, 2, 4, 5), WIDTH_PX)
     walk = [*first, *second]
 
-    def session(subject: Subject, camera: Any) -> Any:
-        return WalkSession(walk, [one.name for one in subject.part.model.components])
+    def session(subjects: Subjects, camera: Any) -> Any:
+        return WalkSession(walk, [one.name for one in subjects[0].part.model.components], camera)
 
-    monkeypatch.setattr(Subject, "session", session)
+    monkeypatch.setattr(Subjects, "session", session)
     chosen = options(
         inspection=None, clients=1, camera=str(PLATE / "camera.json"), width=640, height=480,
         jobs=JobOptions(folder=tmp_path / "jobs"),

@@ -18,7 +18,7 @@ from arview.camera import Camera
 from arview.overlay.guide import GUIDE_RGB
 from arview.pose import ComponentPresence, Identity, Presence, Visibility
 from arview.station.live.stream.stamp import Stamp, stamp_strip
-from arview.station.live.stream.subject import Subject
+from arview.station.live.stream.subjects import Subjects
 from arview.video import VideoSink
 from helpers import live_browser
 from helpers.live_browser import closed, difference_mask, number_in, outline_errors_px, screenshot, true_mask
@@ -38,13 +38,13 @@ MEDIAN_PX, MAX_PX = 1.5, 4.0
 @pytest.fixture(scope="module", autouse=True)
 def told_sessions() -> Iterator[None]:
     """Sessions say what the tests want; the ghost of what they do not verify would be too faint to be measured."""
-    start = Subject.session
+    start = Subjects.session
 
-    def session(subject: Subject, camera: Camera) -> Any:
-        return Told(start(subject, camera), [one.name for one in subject.part.model.components])
+    def session(subjects: Subjects, camera: Camera) -> Any:
+        return Told(start(subjects, camera), [one.name for one in subjects[0].part.model.components])
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Subject, "session", session)
+        patch.setattr(Subjects, "session", session)
         yield
 
 
@@ -215,7 +215,7 @@ def test_the_user_confirms_the_part(chromium: Any, inspection: Path, monkeypatch
     reason = "another part of this kind is in view; confirm that this is the one"
     asked: list[str] = []
 
-    def confirm(self: Told) -> None:
+    def confirm(self: Told, part: int | None) -> None:
         asked.append("confirm")
         TOLD["more"] = {"identity": Identity.CONFIRMED}
 

@@ -32,7 +32,8 @@ BOXES = """[...document.querySelectorAll('#labels .label:not(.off)')].map((one) 
 class TrueSession:
     """Both specimens at their true poses; what is told of the second one changes."""
 
-    camera = estimate = None
+    camera: Camera | None = None
+    estimate = None
 
     def __init__(self, names: list[str]) -> None:
         self.components = dict.fromkeys(names, ComponentPresence(Presence.PRESENT, Visibility.VISIBLE, 0.99, 9, 40.0))
@@ -79,6 +80,7 @@ def session() -> Iterator[TrueSession]:
     made: list[TrueSession] = []
 
     def start(subjects: Subjects, camera: Camera) -> TrueSession:
+        made[0].camera = camera
         made[0].components = dict.fromkeys(
             [one.name for one in subjects[0].part.model.components], next(iter(made[0].components.values()))
         )

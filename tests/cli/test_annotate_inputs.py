@@ -44,9 +44,9 @@ pytestmark = pytest.mark.slow
 class Never(FakeSession):
     """Does not find the part in any frame."""
 
-    def process(self, image: object, index: int, time_s: float) -> Pose:
+    def process(self, image: object, index: int, time_s: float) -> tuple[Pose, ...]:
         """A frame without a pose."""
-        return Pose(None, None, 0.0, TrackingState.SEARCHING, time_s, index, 1.0, "too dark", ())
+        return (Pose(None, None, 0.0, TrackingState.SEARCHING, time_s, index, 1.0, "too dark", ()),)
 
 
 @pytest.fixture(scope="session")

@@ -187,13 +187,13 @@ def test_annotate_aligns_with_a_guide_view(room: Path, monkeypatch: pytest.Monke
     class Waiting(FakeSession):
         """Waits for the part, in the dark now and then."""
 
-        def __init__(self, *arguments: Any, guide_cam_from_model: Any = None, **others: Any) -> None:
-            guides.append(guide_cam_from_model)
-            super().__init__(*arguments, **others)
+        def __init__(self, parts: Any, *arguments: Any, **others: Any) -> None:
+            guides.append(parts[0].guide_cam_from_model)
+            super().__init__(parts, *arguments, **others)
 
-        def process(self, image: object, index: int, time_s: float) -> Pose:
+        def process(self, image: object, index: int, time_s: float) -> tuple[Pose, ...]:
             reason = "too dark" if index % 3 == 0 else f"only {index} % of the outline found"
-            return Pose(None, None, 0.0, TrackingState.SEARCHING, time_s, index, 1.0, reason, (), guides[-1])
+            return (Pose(None, None, 0.0, TrackingState.SEARCHING, time_s, index, 1.0, reason, (), guides[-1]),)
 
     monkeypatch.setattr(arview.tracking, "TrackingSession", Waiting)
     for name, azimuth_deg, elevation_deg in (("start", 5.0, 40.0), ("az-10_el50_d400", -10.0, 50.0)):
@@ -379,7 +379,7 @@ def test_empty_ranges(room: Path) -> None:
 
 
 def test_unexpected_errors_are_one_line(room: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def explode(self: FakeSession, image: object, index: int, time_s: float) -> Pose:
+    def explode(self: FakeSession, image: object, index: int, time_s: float) -> tuple[Pose, ...]:
         raise ZeroDivisionError("by nothing")
 
     monkeypatch.setattr(FakeSession, "process", explode)

@@ -34,7 +34,7 @@ from arview.guideviews import GuideViewOptions, make_guide_views
 from arview.guideviews.sphere import icosphere_directions
 from arview.pose import TrackingState
 from arview.refinement.evidence import EdgeSteps, PoseEvidence
-from arview.tracking import TrackingSession
+from arview.tracking import SpecimenTracking
 from helpers.cad_files import box
 from helpers.synthetic import (
     CAMERA,
@@ -361,7 +361,7 @@ def test_small_parts_plain_views_and_competitors_lower_the_quality() -> None:
 def test_an_ambiguous_view_has_alternatives() -> None:
     model = knob(1.8)
     views = make_guide_views(model, ViewRange((250.0, 700.0), (20.0, 90.0)), GuideViewOptions(subdivisions=3))
-    session = TrackingSession(views, CAMERA, model)
+    session = SpecimenTracking(views, CAMERA, model)
     truth = pose_from(15.0, 50.0, 380.0, model)
     pose = session.process(picture(truth, model, seed=1, scene=1), 0, 0.0)
     assert pose.state == TrackingState.CRITICAL and pose.reason.startswith("ambiguous")

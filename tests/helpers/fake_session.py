@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import os
 import time
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from arview.geometry import look_at
 from arview.pose import Pose, TrackingState
+from arview.tracking import TrackedPart
 
 POSE = look_at([320.0, 30.0, 250.0], [30.0, 30.0, 5.0], [0.0, 0.0, 1.0])
 
@@ -17,19 +19,21 @@ POSE = look_at([320.0, 30.0, 250.0], [30.0, 30.0, 5.0], [0.0, 0.0, 1.0])
 class FakeSession:
     """Stands still where it is told to, or at POSE; takes the time of a slow tracker when asked to."""
 
+    camera_estimate = None
+
     def __init__(
-        self,
-        views: Any,
-        model: Any,
-        camera: Any,
-        options: Any,
-        initial_cam_from_model: Any = None,
-        guide_cam_from_model: Any = None,
-        serials: Any = None,
+        self, parts: Sequence[TrackedPart], camera: Any, options: Any = None, is_guessed: bool = False
     ) -> None:
-        self.pose = POSE if initial_cam_from_model is None else initial_cam_from_model
+        self.pose = POSE if parts[0].initial_cam_from_model is None else parts[0].initial_cam_from_model
+        self.camera = camera
         self.seconds = float(os.environ.get("FAKE_SESSION_S", "0"))
 
-    def process(self, image: object, index: int, time_s: float) -> Pose:
+    def process(self, image: object, index: int, time_s: float) -> tuple[Pose, ...]:
         time.sleep(self.seconds)
-        return Pose(self.pose, np.eye(6), 0.9, TrackingState.TRACKED, time_s, index, 1.0)
+        return (Pose(self.pose, np.eye(6), 0.9, TrackingState.TRACKED, time_s, index, 1.0),)
+
+    def camera_of(self, index: int) -> Any:
+        return self.camera
+
+    def finish(self) -> None:
+        """Nothing is estimated."""

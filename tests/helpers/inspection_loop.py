@@ -132,18 +132,19 @@ def number_in(image: Image) -> int | None:
 class WalkSession:
     """A session that is told where the camera is: at the place whose number the picture shows."""
 
-    def __init__(self, walk: Sequence[Stop], names: Sequence[str]) -> None:
-        self.walk = walk
-        self.identity = self
+    estimate = None
+
+    def __init__(self, walk: Sequence[Stop], names: Sequence[str], camera: Any) -> None:
+        self.walk, self.camera = walk, camera
         present = ComponentPresence(Presence.PRESENT, Visibility.VISIBLE, 0.99, 9, 40.0)
         self._components = dict.fromkeys(names, present)
 
-    def process(self, image: Image, index: int, time_s: float) -> Pose:
+    def process(self, image: Image, index: int, time_s: float) -> tuple[Pose, ...]:
         number = number_in(image)
         if number is None or number >= len(self.walk):
-            return Pose(None, None, 0.0, TrackingState.SEARCHING, time_s, index, 1.0)
+            return (Pose(None, None, 0.0, TrackingState.SEARCHING, time_s, index, 1.0),)
         pose, trust = self.walk[number].cam_from_model, 1e-4 * np.eye(6)
-        return Pose(pose, trust, 0.95, TrackingState.TRACKED, time_s, index, 1.0, components=self._components)
+        return (Pose(pose, trust, 0.95, TrackingState.TRACKED, time_s, index, 1.0, components=self._components),)
 
     def expect(self, serials: Any) -> None:
         pass

@@ -17,8 +17,10 @@ class Told:
     def __getattr__(self, name: str) -> Any:
         return getattr(self._session, name)
 
-    def process(self, image: Any, index: int, time_s: float) -> Pose:
-        pose = self._session.process(image, index, time_s)
+    def process(self, image: Any, index: int, time_s: float) -> tuple[Pose, ...]:
+        return tuple(self._told(pose) for pose in self._session.process(image, index, time_s))
+
+    def _told(self, pose: Pose) -> Pose:
         present = ComponentPresence(Presence.PRESENT, Visibility.VISIBLE, 0.99, 9, 40.0)
         components = {**dict.fromkeys(self._names, present), **TOLD["components"]}
         return replace(pose, components=components if pose.cam_from_model is not None else {}, **TOLD["more"])

@@ -34,9 +34,10 @@ PRESENT = ComponentPresence(Presence.PRESENT, Visibility.VISIBLE, 0.99, 9, 40.0)
 class TrueSession:
     """Recognises the frames of the clip."""
 
-    camera = estimate = None
+    estimate = None
 
-    def __init__(self, images: Sequence[Image], names: Sequence[str]) -> None:
+    def __init__(self, images: Sequence[Image], names: Sequence[str], camera: object) -> None:
+        self.camera = camera
         self._small = np.stack([_small(image) for image in images])
         self._names = names
 
@@ -88,7 +89,7 @@ def told_station(folder: Path, width: int, height: int, has_numbers: bool = True
     inspection.write_text(json.dumps(record))
 
     def session(subjects: Subjects, camera: object) -> TrueSession:
-        return TrueSession(images, [one.name for one in subjects[0].part.model.components])
+        return TrueSession(images, [one.name for one in subjects[0].part.model.components], camera)
 
     chosen = options(**{"source": str(path), "inspection": inspection, "record_folder": folder, **more})
     with mock.patch.object(Subjects, "session", session), running(chosen, loader(chosen)) as server:

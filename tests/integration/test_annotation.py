@@ -39,13 +39,13 @@ class Pictures(FrameSource):
 class Walk:
     """A session that tracks, moving by 1 mm a frame, loses every fourth frame, and sees the post in the sixth alone."""
 
-    def process(self, image: Image, index: int, time_s: float) -> Pose:
+    def process(self, image: Image, index: int, time_s: float) -> tuple[Pose, ...]:
         if index % 4 == 3:
-            return Pose(None, None, 0.1, TrackingState.LOST, time_s, index, 0.5)
+            return (Pose(None, None, 0.1, TrackingState.LOST, time_s, index, 0.5),)
         place = np.eye(4)
         place[:3, 3] = [index, 0.0, 500.0]
         unverified = ("nut",) if index == 5 else ("post", "nut")
-        return Pose(place, np.eye(6), 0.9, TrackingState.TRACKED, time_s, index, 1.5, unverified=unverified)
+        return (Pose(place, np.eye(6), 0.9, TrackingState.TRACKED, time_s, index, 1.5, unverified=unverified),)
 
 
 class Mark:
@@ -54,7 +54,8 @@ class Mark:
     def __init__(self, seconds: float = 0.0, fail_at: int | None = None) -> None:
         self.seconds, self.fail_at, self.drawn = seconds, fail_at, 0
 
-    def draw(self, image: Image, pose: Pose, fps: float | None = None) -> Image:
+    def draw(self, image: Image, poses: tuple[Pose, ...], /, fps: float | None = None) -> Image:
+        (pose,) = poses
         time.sleep(self.seconds)
         if pose.index == self.fail_at:
             raise RuntimeError("drawing failed")

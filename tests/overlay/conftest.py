@@ -8,4 +8,4 @@ import pytest
 @pytest.fixture
 def no_arrows(monkeypatch: pytest.MonkeyPatch) -> None:
     """Displacements are drawn without arrows."""
-    monkeypatch.setattr("arview.overlay.renderer.SHOW_ARROWS", False)
+    monkeypatch.setattr("arview.overlay.part_layers.SHOW_ARROWS", False)

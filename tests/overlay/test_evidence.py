@@ -226,7 +226,7 @@ def test_the_legend_explains_only_what_is_in_the_picture(model: Model, record: I
     for shown in (True, False):
         renderer = OverlayRenderer(model, CAMERA, record, OverlayOptions(show_legend=shown))
         pictures[shown] = renderer.draw(GREY, posed({"p1": seen(Presence.MISSING)}), now=NOW)
-        legend_top = 480 - renderer._status.height_px - 30
+        legend_top = 480 - renderer.status_height_px - 30
         if shown:
             assert all(one.box.y + one.box.height <= legend_top for one in renderer.laid_out.labels)
     differs = np.flatnonzero(np.any(pictures[True] != pictures[False], axis=(1, 2)))

@@ -112,7 +112,7 @@ def test_thirty_layouts(size: tuple[int, int], kind: str, seed: int) -> None:
             start, end = name.split("…")
             assert start and label.text.name.startswith(start) and label.text.name.endswith(end)
         assert label.box.x >= 0 and label.box.x + label.box.width <= width
-        assert label.box.y >= 0 and label.box.y + label.box.height <= height - renderer._status.height_px
+        assert label.box.y >= 0 and label.box.y + label.box.height <= height - renderer.status_height_px
     assert overlapping(laid_out) == 0
     assert crossed_pairs(laid_out) == []
     urgent = {one.name for one in renderer.inspection.components if one.verdict != "pass"}  # type: ignore[union-attr]
@@ -120,7 +120,7 @@ def test_thirty_layouts(size: tuple[int, int], kind: str, seed: int) -> None:
     assert urgent and urgent <= shown
     for pointer in laid_out.pointers:
         for end in (pointer.tail_px, pointer.tip_px):
-            assert -2 <= end[0] <= width + 1 and -2 <= end[1] <= height - renderer._status.height_px + 1
+            assert -2 <= end[0] <= width + 1 and -2 <= end[1] <= height - renderer.status_height_px + 1
 
 
 @pytest.mark.parametrize("widest_px", [60, 100, 166, 320])

@@ -419,7 +419,7 @@ def test_labels_keep_apart_and_glide(plate: Model, record: Inspection, size: tup
         assert largest_step_px(before, boxes) <= height / 60.0
         for label in boxes:
             assert label.x >= 0 and label.x + label.width <= width
-            assert label.y >= 0 and label.y + label.height <= height - renderer._status.height_px
+            assert label.y >= 0 and label.y + label.height <= height - renderer.status_height_px
         on_posts = np.zeros((height, width), dtype=bool)
         for component in plate.components[1:]:
             u, v = np.round(camera.project(apply(cam_from_model, component.vertices_in_model))).astype(int).T

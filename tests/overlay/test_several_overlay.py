@@ -5,14 +5,12 @@ from __future__ import annotations
 from functools import cache
 
 import numpy as np
-import pytest
 
 from arview.cad import load_part
-from arview.errors import InputError
 from arview.inspection import load_inspection
 from arview.overlay import OverlayRenderer
 from arview.overlay.layout import PlacedLabel
-from arview.overlay.several import SeveralOverlay, specimen_rgb
+from arview.overlay.renderer import specimen_rgb
 from arview.pose import ComponentPresence, Pose, Presence, TrackingState, Visibility
 from helpers import two_specimens
 from helpers.live_sample import INSPECTION, PART
@@ -21,10 +19,12 @@ SEEN = ComponentPresence(Presence.PRESENT, Visibility.VISIBLE, 0.99, 9, 40.0)
 
 
 @cache
-def overlay() -> SeveralOverlay:
+def overlay() -> OverlayRenderer:
     model = load_part(str(PART)).model
     inspection, camera = load_inspection(INSPECTION, model), two_specimens.wide_camera()
-    return SeveralOverlay({name: OverlayRenderer(model, camera, inspection) for name in ("plate#1", "plate#2")})
+    renderer = OverlayRenderer(model, camera, inspection, name="plate#1")
+    renderer.add(model, inspection, name="plate#2")
+    return renderer
 
 
 def poses(index: int) -> tuple[Pose, ...]:
@@ -59,9 +59,7 @@ def test_both_specimens_have_labels_that_do_not_cover_each_other() -> None:
 
 
 def test_status_lines_are_stacked() -> None:
-    rows = [
-        (one._status.bottom_px - one.status_height_px, one._status.bottom_px) for one in overlay().renderers.values()
-    ]
+    rows = [(one._status.bottom_px - one.status_height_px, one._status.bottom_px) for one in overlay()._layers.values()]
     assert rows[0][1] == rows[1][0] and rows[1][1] == overlay().camera.height
 
 
@@ -69,8 +67,3 @@ def test_tags_differ_in_colour_and_mark() -> None:
     colors = [specimen_rgb(number) for number in range(6)]
     assert min(sum(abs(a - b) for a, b in zip(x, y, strict=True)) for x in colors for y in colors if x != y) > 40
     assert len({tuple(sprite.alpha.ravel().tolist()) for sprite in overlay()._tags.values()}) == 2
-
-
-def test_no_renderer_is_refused() -> None:
-    with pytest.raises(InputError, match="no renderer"):
-        SeveralOverlay({})

@@ -16,7 +16,7 @@ from arview.geometry import Array, apply, rotation_angle_rad
 from arview.guideviews import GuideViewOptions, GuideViewSet, make_guide_views
 from arview.pose import TrackingState
 from arview.refinement.evidence import PoseEvidence
-from arview.tracking import Estimate, SessionOptions, TrackingSession, appearance_memory, search_plan
+from arview.tracking import Estimate, SessionOptions, SpecimenTracking, appearance_memory, search_plan
 from arview.tracking import session as session_module
 from arview.tracking.appearance_memory import MAX_VIEWS, AppearanceMemory
 from arview.tracking.search.ncc_search import MAX_RESULTS
@@ -167,8 +167,8 @@ def no_search(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.slow
 @pytest.mark.usefixtures("no_search")
 def test_no_pose_is_accepted_without_the_part() -> None:
-    session = TrackingSession(assembly_views(), CAMERA, assembly())
-    session.appearance_memory = six_sides()
+    session = SpecimenTracking(assembly_views(), CAMERA, assembly())
+    session.search.memory = six_sides()
     session._state.state = TrackingState.LOST
     for k in range(12):
         session._state.last_sure_pose = pose_from(*SIDES[k % 6], 520)
@@ -186,11 +186,11 @@ def test_a_lost_part_is_found_by_its_appearance() -> None:
     found = {}
     for use_appearance_memory in (True, False):
         options = SessionOptions(use_appearance_memory=use_appearance_memory)
-        session = TrackingSession(assembly_views(), CAMERA, assembly(), options, initial_cam_from_model=path(1)[0])
+        session = SpecimenTracking(assembly_views(), CAMERA, assembly(), options, initial_cam_from_model=path(1)[0])
         for k, pose in enumerate(path(20)):
             tracked = session.process(picture(pose, seed=k, scene=1), k, k / 30)
         assert tracked.state == TrackingState.TRACKED
-        assert len(session.appearance_memory) == (1 if use_appearance_memory else 0)
+        assert len(session.search.memory) == (1 if use_appearance_memory else 0)
         while session.state != TrackingState.LOST:
             session.process(np.full((480, 640, 3), 90, dtype=np.uint8), 20, 1.0)
         truth = path(20)[-1]

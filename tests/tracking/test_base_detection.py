@@ -11,7 +11,7 @@ from arview.detection.detector import Detector
 from arview.geometry import Array, apply
 from arview.pose import Presence
 from arview.refinement.view_model import PartView
-from arview.tracking import TrackingSession
+from arview.tracking import SpecimenTracking
 from arview.tracking.base_detection import MIN_QUALITY, WHOLE_FRAMES, BaseDetection
 from helpers.synthetic import CAMERA, assembly, assembly_views, block, changed, picture, pose_from
 
@@ -67,7 +67,7 @@ def test_a_part_of_one_component_has_no_base_to_look_for() -> None:
 
 @pytest.mark.slow
 def test_a_session_finds_a_bare_base_and_says_of_nothing_that_it_is_present() -> None:
-    session = TrackingSession(assembly_views(), CAMERA, assembly())
+    session = SpecimenTracking(assembly_views(), CAMERA, assembly())
     followed = 0
     for k in range(10):
         pose = pose_from(-20 + 4 * k, 40, 520)

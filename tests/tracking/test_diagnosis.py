@@ -12,7 +12,7 @@ from arview.detection.detector import RejectedHypothesis
 from arview.geometry import Array
 from arview.pose import TrackingState
 from arview.refinement.evidence import PoseEvidence
-from arview.tracking import Estimate, TrackingSession
+from arview.tracking import Estimate, SpecimenTracking
 from arview.tracking.diagnosis import (
     BLURRED,
     NOTHING_IN_VIEW,
@@ -201,10 +201,10 @@ def test_why_a_part_was_lost() -> None:
 
 
 def test_a_session_says_what_the_detector_rejected() -> None:
-    session = TrackingSession(assembly_views(), CAMERA, assembly())
+    session = SpecimenTracking(assembly_views(), CAMERA, assembly())
     far = pose_from(30, 40, 820)
-    session.detector.detect = lambda *_, **__: []  # type: ignore[method-assign]
-    session.detector.best_rejected = RejectedHypothesis(far, GOOD, 0.9)
+    session.search.detector.detect = lambda *_, **__: []  # type: ignore[method-assign]
+    session.search.detector.best_rejected = RejectedHypothesis(far, GOOD, 0.9)
     result = session.process(picture(far), 0, 0.0)
     assert result.state == TrackingState.SEARCHING
     assert result.reason == "too far: about 820 mm, declared up to 640 mm"
@@ -212,7 +212,7 @@ def test_a_session_says_what_the_detector_rejected() -> None:
 
 @pytest.mark.slow
 def test_a_lost_part_keeps_the_reason_of_its_loss() -> None:
-    session = TrackingSession(assembly_views(), CAMERA, assembly(), initial_cam_from_model=TRUTH)
+    session = SpecimenTracking(assembly_views(), CAMERA, assembly(), initial_cam_from_model=TRUTH)
     reasons: list[str] = []
     for k in range(40):
         pose = TRUTH.copy()

@@ -16,7 +16,7 @@ def test_a_tracked_frame_takes_few_calls_and_enters_few_folders(monkeypatch: pyt
     monkeypatch.syspath_prepend(str(TOOLS / "benchmarks"))
     frame_path = importlib.import_module("frame_path").frame_path
     poses = path(4)
-    session = TrackingSession(assembly_views(), CAMERA, assembly(), initial_cam_from_model=poses[0])
+    session = TrackingSession.of(assembly_views(), CAMERA, assembly(), initial_cam_from_model=poses[0])
     with pytest.raises(ArviewError, match="searching, not tracked"):
         frame_path(session, picture(poses[0]), 0)
     for index, pose in enumerate(poses[:-1]):
@@ -24,7 +24,8 @@ def test_a_tracked_frame_takes_few_calls_and_enters_few_folders(monkeypatch: pyt
     followed = frame_path(session, picture(poses[-1], seed=3), 3)
     assert followed.chain == (
         "TrackingSession.process",
-        "TrackingSession._follow",
+        "SpecimenTracking.process",
+        "SpecimenTracking._follow",
         "Tracker.track",
         "Tracker._refine",
         "RefinementPyramid.refine",

@@ -19,10 +19,10 @@ from arview.geometry import Array, apply, exp_se3, rigid
 from arview.guideviews import GuideViewOptions, make_guide_views
 from arview.overlay import OverlayOptions, OverlayRenderer
 from arview.pose import Pose, TrackingState
-from arview.tracking import TrackingSession
+from arview.tracking import SpecimenTracking
 from arview.tracking.guide_pose import guide_names, guide_pose
 from arview.tracking.guided_init import GuidedInit
-from arview.tracking.session import ALIGN
+from arview.tracking.part_search import ALIGN
 from helpers.cad_files import box, obj_text
 from helpers.synthetic import CAMERA, RANGE, assembly, assembly_views, block, error, picture, pose_from
 
@@ -253,7 +253,7 @@ def aligning(count: int) -> list[Array]:
 
 @pytest.mark.slow
 def test_the_session_waits_for_the_part_and_tracks_it() -> None:
-    session = TrackingSession(assembly_views(), CAMERA, assembly(), guide_cam_from_model=GUIDE)
+    session = SpecimenTracking(assembly_views(), CAMERA, assembly(), guide_cam_from_model=GUIDE)
     poses = aligning(16)
     results = [session.process(picture(pose, seed=k, scene=3), k, 0.0) for k, pose in enumerate(poses)]
     states = [result.state for result in results]
@@ -274,8 +274,8 @@ def test_the_session_waits_for_the_part_and_tracks_it() -> None:
 
 @pytest.mark.slow
 def test_the_outline_comes_back_when_a_lost_part_is_not_found_for_long(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("arview.tracking.session.ALIGN_AGAIN_FRAMES", 4)
-    session = TrackingSession(assembly_views(), CAMERA, assembly(), guide_cam_from_model=GUIDE)
+    monkeypatch.setattr("arview.tracking.part_search.ALIGN_AGAIN_FRAMES", 4)
+    session = SpecimenTracking(assembly_views(), CAMERA, assembly(), guide_cam_from_model=GUIDE)
     for k in range(4):
         result = session.process(picture(GUIDE, seed=k, scene=3), k, 0.0)
     assert result.state == TrackingState.TRACKED
@@ -290,7 +290,7 @@ def test_the_outline_comes_back_when_a_lost_part_is_not_found_for_long(monkeypat
 
 
 def test_an_unconfirmed_pose_goes_back_to_waiting() -> None:
-    session = TrackingSession(assembly_views(), CAMERA, assembly(), guide_cam_from_model=GUIDE)
+    session = SpecimenTracking(assembly_views(), CAMERA, assembly(), guide_cam_from_model=GUIDE)
     assert session.process(picture(GUIDE, seed=0, scene=3), 0, 0.0).state == TrackingState.CRITICAL
     result = session.process(picture(None, seed=1, scene=3), 1, 0.0)
     assert (result.state, result.cam_from_model, result.reason) == (TrackingState.SEARCHING, None, ALIGN)
@@ -298,7 +298,7 @@ def test_an_unconfirmed_pose_goes_back_to_waiting() -> None:
 
 
 def test_a_dark_picture_is_said_to_be_dark_while_aligning() -> None:
-    session = TrackingSession(assembly_views(), CAMERA, assembly(), guide_cam_from_model=GUIDE)
+    session = SpecimenTracking(assembly_views(), CAMERA, assembly(), guide_cam_from_model=GUIDE)
     result = session.process(picture(GUIDE, gain=0.1), 0, 0.0)
     assert (result.state, result.reason) == (TrackingState.SEARCHING, "too dark")
 

@@ -15,11 +15,12 @@ from arview.fiducials.serial_code import SerialNumbers
 from arview.geometry import Array, apply, invert, rigid
 from arview.pose import Identity, Pose, TrackingState
 from arview.refinement.evidence import PoseEvidence
-from arview.tracking import Estimate, TrackingSession
+from arview.tracking import Estimate, SpecimenTracking
 from arview.tracking.guided_init import GuidedPose
 from arview.tracking.identity import IdentityMonitor
 from arview.tracking.identity.background_motion import BackgroundMotion, reduced
-from arview.tracking.identity.monitor import ANOTHER_IN_VIEW, CHECKING, MOVED
+from arview.tracking.identity.doubt import ANOTHER_IN_VIEW, MOVED
+from arview.tracking.identity.monitor import CHECKING
 from arview.tracking.identity.part_outline import PartOutline, transfer
 from helpers.synthetic import assembly, assembly_views
 from helpers.turning_bench import CAMERA, LEFT, RIGHT, bench, covered, frame
@@ -35,17 +36,11 @@ class FakeFinders:
     searches: int = 0
     others: tuple[Array, ...] = ()
 
-    @property
-    def detector(self) -> FakeFinders:
-        return self
+    def monitor(self, serials: SerialNumbers | None = None) -> IdentityMonitor:
+        """A monitor that uses these searches."""
+        return IdentityMonitor(assembly_views(), CAMERA, self.find, self.detect, serials)
 
-    @property
-    def guided_init(self) -> FakeFinders:
-        return self
-
-    def detect(
-        self, image: NDArray[np.uint8], max_results: int = 3, is_thorough: bool = True, guesses: object = ()
-    ) -> list[Detection]:
+    def detect(self, image: NDArray[np.uint8], max_results: int, is_thorough: bool) -> list[Detection]:
         self.searches += 1
         return [Detection(pose, 0.9) for pose in self.poses]
 
@@ -69,10 +64,11 @@ def turned(yaw_deg: float, seed: int, pose: Array) -> tuple[NDArray[np.uint8], A
 
 def monitor_after(frames: int = 12) -> tuple[IdentityMonitor, FakeFinders]:
     """A monitor that has followed the left specimen."""
-    monitor, finders = IdentityMonitor(assembly_views(), CAMERA), FakeFinders()
+    finders = FakeFinders()
+    monitor = finders.monitor()
     for i in range(frames):
         image, pose = turned(0.3 * i, i, LEFT)
-        assert monitor.update(image, estimate(pose), i, i / 30.0, finders).identity is Identity.FOLLOWED
+        assert monitor.update(image, estimate(pose), i, i / 30.0, finders.others).identity is Identity.FOLLOWED
     assert finders.searches == 0
     return monitor, finders
 
@@ -123,9 +119,9 @@ def test_a_part_found_again_at_its_place_is_followed_at_once() -> None:
     monitor, finders = monitor_after()
     for i in range(12, 40):
         image, pose = turned(0.3 * i, i, LEFT)
-        monitor.update(image, None, i, i / 30.0, finders)
+        monitor.update(image, None, i, i / 30.0, finders.others)
     image, pose = turned(12.0, 40, LEFT)
-    assert monitor.update(image, estimate(pose), 40, 40 / 30.0, finders).identity is Identity.FOLLOWED
+    assert monitor.update(image, estimate(pose), 40, 40 / 30.0, finders.others).identity is Identity.FOLLOWED
     assert finders.searches == 0
 
 
@@ -133,17 +129,17 @@ def test_a_part_found_again_at_its_place_is_followed_at_once() -> None:
 def test_a_pose_on_another_specimen_withholds_the_labels(gap: int) -> None:
     monitor, finders = monitor_after()
     for i in range(12, 12 + gap):
-        monitor.update(turned(3.6, i, LEFT)[0], None, i, i / 30.0, finders)
+        monitor.update(turned(3.6, i, LEFT)[0], None, i, i / 30.0, finders.others)
     finders.poses = [turned(3.6, 0, LEFT)[1], turned(3.6, 0, RIGHT)[1]]
     for i in range(12 + gap, 80 + gap):
         image, pose = turned(3.6, i, RIGHT)
-        result = monitor.update(image, estimate(pose), i, i / 30.0, finders)
+        result = monitor.update(image, estimate(pose), i, i / 30.0, finders.others)
         assert result.identity is Identity.UNCONFIRMED
         assert result.reason == ANOTHER_IN_VIEW
     # A weak pose on it changes nothing, and the user's word ends it.
-    assert monitor.update(image, estimate(pose, 0.3), 200, 200 / 30.0, finders).identity is Identity.UNCONFIRMED
+    assert monitor.update(image, estimate(pose, 0.3), 200, 200 / 30.0, finders.others).identity is Identity.UNCONFIRMED
     monitor.confirm()
-    assert monitor.update(image, estimate(pose), 201, 201 / 30.0, finders).identity is Identity.CONFIRMED
+    assert monitor.update(image, estimate(pose), 201, 201 / 30.0, finders.others).identity is Identity.CONFIRMED
 
 
 def test_the_session_goes_back_to_the_followed_specimen_when_it_is_seen_again() -> None:
@@ -154,14 +150,14 @@ def test_the_session_goes_back_to_the_followed_specimen_when_it_is_seen_again() 
         image, pose = turned(3.6, i, RIGHT)
         if i == 30:
             finders.poses.append(turned(3.6, 0, LEFT)[1])
-        result = monitor.update(image, estimate(pose), i, i / 30.0, finders)
+        result = monitor.update(image, estimate(pose), i, i / 30.0, finders.others)
         assert result.identity is Identity.UNCONFIRMED
         if result.cam_from_model is not None:
             back = i
             break
     assert back is not None and 30 <= back <= 45
     image, pose = turned(3.6, 60, LEFT)
-    assert monitor.update(image, estimate(pose), 60, 2.0, finders).identity is Identity.FOLLOWED
+    assert monitor.update(image, estimate(pose), 60, 2.0, finders.others).identity is Identity.FOLLOWED
 
 
 def test_a_lone_part_that_was_moved_has_its_labels_back_within_a_second() -> None:
@@ -170,7 +166,7 @@ def test_a_lone_part_that_was_moved_has_its_labels_back_within_a_second() -> Non
     for i in range(12, 60):
         image, pose = turned(3.6, i, RIGHT)
         finders.poses = []
-        result = monitor.update(image, estimate(pose), i, i / 30.0, finders)
+        result = monitor.update(image, estimate(pose), i, i / 30.0, finders.others)
         if i == 12:
             assert (result.identity, result.reason) == (Identity.UNCONFIRMED, CHECKING)
         if result.identity is Identity.FOLLOWED and first is None:
@@ -179,16 +175,17 @@ def test_a_lone_part_that_was_moved_has_its_labels_back_within_a_second() -> Non
 
 
 def test_a_part_whose_place_was_not_in_view_before_stays_unconfirmed() -> None:
-    monitor, finders = IdentityMonitor(assembly_views(), CAMERA), FakeFinders()
+    finders = FakeFinders()
+    monitor = finders.monitor()
     yaws = np.concatenate([np.full(10, 33.0), np.linspace(33.0, -10.0, 25)])
     for i in range(10):
         image, pose = turned(yaws[i], i, LEFT)
-        monitor.update(image, estimate(pose), i, i / 30.0, finders)
+        monitor.update(image, estimate(pose), i, i / 30.0, finders.others)
     for i in range(10, 35):
-        monitor.update(turned(yaws[i], i, LEFT)[0], None, i, i / 30.0, finders)
+        monitor.update(turned(yaws[i], i, LEFT)[0], None, i, i / 30.0, finders.others)
     for i in range(35, 80):
         image, pose = turned(-10.0, i, RIGHT)
-        result = monitor.update(image, estimate(pose), i, i / 30.0, finders)
+        result = monitor.update(image, estimate(pose), i, i / 30.0, finders.others)
     assert (result.identity, result.reason) == (Identity.UNCONFIRMED, MOVED)
 
 
@@ -197,45 +194,47 @@ def test_without_a_background_a_lone_part_is_followed_and_one_of_two_is_not() ->
         monitor, finders = monitor_after()
         blank = np.full((CAMERA.height, CAMERA.width, 3), 90, dtype=np.uint8)
         for i in range(12, 30):
-            monitor.update(blank, None, i, i / 30.0, finders)
+            monitor.update(blank, None, i, i / 30.0, finders.others)
         finders.poses = [turned(3.6, 0, pose)[1] for pose in others]
         found = turned(3.6, 0, LEFT)[1].copy()
         found[0, 3] += 250.0
         # It is settled in the first frame: none is withheld of a lone part, and none shown of one of two.
         for i in range(30, 40):
-            result = monitor.update(blank, estimate(found), i, i / 30.0, finders)
+            result = monitor.update(blank, estimate(found), i, i / 30.0, finders.others)
             assert result.identity is expected
         assert finders.searches > 0
 
 
 def test_a_specimen_that_another_session_tracks_is_not_taken_for_this_one() -> None:
     for is_tracked, expected in ((True, Identity.FOLLOWED), (False, Identity.UNCONFIRMED)):
-        monitor, finders = IdentityMonitor(assembly_views(), CAMERA), FakeFinders()
+        finders = FakeFinders()
+        monitor = finders.monitor()
         image, left = turned(0.0, 0, LEFT)
         right = turned(0.0, 0, RIGHT)[1]
         finders.others = (right,) if is_tracked else ()
         for i in range(12):
-            monitor.update(image, estimate(left), i, i / 30.0, finders)
+            monitor.update(image, estimate(left), i, i / 30.0, finders.others)
         blank = np.full_like(image, 90)
         for i in range(12, 30):
-            monitor.update(blank, None, i, i / 30.0, finders)
+            monitor.update(blank, None, i, i / 30.0, finders.others)
         finders.poses = [right]
         moved = left.copy()
         moved[0, 3] -= 250.0
         for i in range(30, 40):
-            result = monitor.update(blank, estimate(moved), i, i / 30.0, finders)
+            result = monitor.update(blank, estimate(moved), i, i / 30.0, finders.others)
         assert result.identity is expected
     # But this session does not take over the place of the other one.
     finders.others = (right,)
     monitor.reset()
     for i in range(12):
-        monitor.update(image, estimate(left), i, i / 30.0, finders)
+        monitor.update(image, estimate(left), i, i / 30.0, finders.others)
     finders.others = ()
-    assert monitor.update(image, estimate(right), 12, 0.4, finders).reason == ANOTHER_IN_VIEW
+    assert monitor.update(image, estimate(right), 12, 0.4, finders.others).reason == ANOTHER_IN_VIEW
 
 
 def test_the_user_names_the_specimen_by_a_pixel() -> None:
-    monitor, finders = IdentityMonitor(assembly_views(), CAMERA), FakeFinders()
+    finders = FakeFinders()
+    monitor = finders.monitor()
     outline = PartOutline(assembly_views(), CAMERA)
     image, left = turned(0.0, 0, LEFT)
     right = turned(0.0, 0, RIGHT)[1]
@@ -245,19 +244,19 @@ def test_the_user_names_the_specimen_by_a_pixel() -> None:
     monitor.name_at(4, (x, y))
     finders.poses = [left, right]
     for i in range(4):
-        result = monitor.update(image, estimate(left), i, i / 30.0, finders)
+        result = monitor.update(image, estimate(left), i, i / 30.0, finders.others)
         assert result.identity is Identity.UNCONFIRMED
         assert "in frame 4" in result.reason
-    result = monitor.update(image, estimate(left), 4, 4 / 30.0, finders)
+    result = monitor.update(image, estimate(left), 4, 4 / 30.0, finders.others)
     assert result.cam_from_model is not None
     assert np.array_equal(result.cam_from_model, right)
-    result = monitor.update(image, estimate(right), 5, 5 / 30.0, finders)
+    result = monitor.update(image, estimate(right), 5, 5 / 30.0, finders.others)
     assert result.identity is Identity.CONFIRMED
     # Where no part is found the labels stay away.
     monitor.reset()
     monitor.name_at(0, (5.0, 5.0))
     for i in range(3):
-        result = monitor.update(image, estimate(left), i, i / 30.0, finders)
+        result = monitor.update(image, estimate(left), i, i / 30.0, finders.others)
         assert result.identity is Identity.UNCONFIRMED
         assert result.reason.startswith("no part of this kind found at 5,5 in frame 0")
 
@@ -276,32 +275,32 @@ def labelled(text: str, seed: int) -> tuple[NDArray[np.uint8], Array]:
 
 def test_a_serial_code_confirms_the_part_or_withholds_its_labels() -> None:
     for text, expected in (("BP-0042", Identity.CONFIRMED), ("BP-0043", Identity.OTHER), ("X", Identity.FOLLOWED)):
-        monitor = IdentityMonitor(assembly_views(), CAMERA, serials=SerialNumbers("BP-0042"))
+        monitor = FakeFinders().monitor(SerialNumbers("BP-0042"))
         for i in range(4):
             image, pose = labelled(text, i)
-            result = monitor.update(image, estimate(pose), i, i / 30.0, FakeFinders())
+            result = monitor.update(image, estimate(pose), i, i / 30.0)
         assert result.identity is expected
         assert result.serial == ("" if text == "X" else text)
         if expected is Identity.OTHER:
             assert result.reason == "the code on this part says BP-0043, the inspection is of BP-0042"
             # Another inspection is shown, to which this part belongs.
             monitor.expect(SerialNumbers("BP-0043"))
-            assert monitor.update(image, estimate(pose), 4, 0.2, FakeFinders()).identity is Identity.CONFIRMED
+            assert monitor.update(image, estimate(pose), 4, 0.2).identity is Identity.CONFIRMED
             monitor.expect(SerialNumbers("BP-0044"))
-            assert monitor.update(image, estimate(pose), 5, 0.2, FakeFinders()).identity is Identity.OTHER
+            assert monitor.update(image, estimate(pose), 5, 0.2).identity is Identity.OTHER
 
 
 def test_a_serial_code_settles_a_doubt() -> None:
-    monitor = IdentityMonitor(assembly_views(), CAMERA, serials=SerialNumbers("BP-0042"))
     finders = FakeFinders()
+    monitor = finders.monitor(SerialNumbers("BP-0042"))
     for i in range(5):
         image, pose = turned(0.0, i, RIGHT)
-        monitor.update(image, estimate(pose), i, i / 30.0, finders)
+        monitor.update(image, estimate(pose), i, i / 30.0, finders.others)
     finders.poses = [turned(0.0, 0, LEFT)[1], turned(0.0, 0, RIGHT)[1]]
     found = []
     for i in range(5, 60):
         image, pose = labelled("BP-0042", i)
-        found.append(monitor.update(image, estimate(pose), i, i / 30.0, finders).identity)
+        found.append(monitor.update(image, estimate(pose), i, i / 30.0, finders.others).identity)
     assert found[0] is Identity.UNCONFIRMED
     assert found[-1] is Identity.CONFIRMED
     assert found.count(Identity.UNCONFIRMED) <= 15
@@ -311,24 +310,24 @@ def test_what_is_known_goes_over_to_the_session_of_another_camera() -> None:
     monitor, finders = monitor_after()
     finders.poses = [turned(3.6, 0, LEFT)[1], turned(3.6, 0, RIGHT)[1]]
     image, pose = turned(3.6, 12, RIGHT)
-    assert monitor.update(image, estimate(pose), 12, 0.4, finders).reason == ANOTHER_IN_VIEW
-    other = IdentityMonitor(assembly_views(), CAMERA)
+    assert monitor.update(image, estimate(pose), 12, 0.4, finders.others).reason == ANOTHER_IN_VIEW
+    other = finders.monitor()
     other.take_over(monitor)
     for i in range(13, 50):
-        result = other.update(image, estimate(pose), i, i / 30.0, finders)
+        result = other.update(image, estimate(pose), i, i / 30.0, finders.others)
         assert (result.identity, result.reason) == (Identity.UNCONFIRMED, ANOTHER_IN_VIEW)
     other.confirm()
-    third = IdentityMonitor(assembly_views(), CAMERA)
+    third = finders.monitor()
     third.take_over(other)
-    assert third.update(image, estimate(pose), 50, 2.0, finders).identity is Identity.CONFIRMED
+    assert third.update(image, estimate(pose), 50, 2.0, finders.others).identity is Identity.CONFIRMED
 
 
 def test_without_the_monitoring_every_pose_is_followed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("arview.tracking.identity.monitor.IS_USED", False)
-    monitor = IdentityMonitor(assembly_views(), CAMERA)
+    monitor = FakeFinders().monitor()
     for i, specimen_pose in enumerate((LEFT, RIGHT, LEFT)):
         image, pose = turned(0.0, i, specimen_pose)
-        assert monitor.update(image, estimate(pose), i, i / 30.0, FakeFinders()).identity is Identity.FOLLOWED
+        assert monitor.update(image, estimate(pose), i, i / 30.0).identity is Identity.FOLLOWED
 
 
 def test_an_outline_holds_its_centre_and_not_the_pixels_beside_it() -> None:
@@ -345,10 +344,10 @@ def test_an_outline_holds_its_centre_and_not_the_pixels_beside_it() -> None:
 # --- Films -----------------------------------------------------------------------------------------------
 
 
-def film(cover: int, with_right: bool, moved: bool = False, count: int = 90) -> tuple[list[Pose], TrackingSession]:
+def film(cover: int, with_right: bool, moved: bool = False, count: int = 90) -> tuple[list[Pose], SpecimenTracking]:
     """The left specimen is tracked and covered from frame 20 on; with ``moved`` it then is at the right place."""
     start = frame(bench(True, False), 0.0, 0)[1] @ LEFT
-    session = TrackingSession(assembly_views(), CAMERA, assembly(), initial_cam_from_model=start)
+    session = SpecimenTracking(assembly_views(), CAMERA, assembly(), initial_cam_from_model=start)
     results = []
     for i in range(count):
         wide = bench(not (moved and i >= 20 + cover), with_right or (moved and i >= 20 + cover))

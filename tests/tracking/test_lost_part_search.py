@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from arview.detection.detector import Detection
 from arview.pose import TrackingState
-from arview.tracking import SessionOptions, TrackingSession
+from arview.tracking import SessionOptions, SpecimenTracking
 from helpers.synthetic import CAMERA, assembly, assembly_views, error, path, picture
 
 OPTIONS = SessionOptions(use_appearance_memory=False)
@@ -33,8 +33,8 @@ class RecordingDetector:
 
 def searches_of(images: list[NDArray[np.uint8]], state: TrackingState = TrackingState.LOST) -> dict[int, Any]:
     """The searches by frame, the first of which is 1."""
-    session = TrackingSession(assembly_views(), CAMERA, assembly(), OPTIONS)
-    detector = vars(session)["_detector"] = RecordingDetector()
+    session = SpecimenTracking(assembly_views(), CAMERA, assembly(), OPTIONS)
+    detector = vars(session.search)["_detector"] = RecordingDetector()
     session._state.state = state
     for frame, image in enumerate(images, 1):
         detector.frame = frame
@@ -79,7 +79,7 @@ def test_a_part_that_was_never_found_is_searched_in_every_frame() -> None:
 @pytest.mark.parametrize("hidden", [17, 24, 40])
 def test_a_part_shown_again_is_found_within_three_frames(hidden: int) -> None:
     poses = path(16)
-    session = TrackingSession(assembly_views(), CAMERA, assembly(), OPTIONS, initial_cam_from_model=poses[0])
+    session = SpecimenTracking(assembly_views(), CAMERA, assembly(), OPTIONS, initial_cam_from_model=poses[0])
     for k, pose in enumerate(poses[:10]):
         tracked = session.process(picture(pose, seed=k, scene=1), k, k / 30)
     assert tracked.state == TrackingState.TRACKED

@@ -17,7 +17,6 @@ from arview.tracking import TrackingSession
 from arview.tracking.self_calibration.edge_lines import line_labels
 from arview.tracking.self_calibration.estimator import FocalEstimate, FocalEstimator, pose_seen_by
 from arview.tracking.self_calibration.frame_set import FrameSet, cropped_frame
-from arview.tracking.self_calibration.session import SelfCalibratingSession
 from helpers.synthetic import assembly, assembly_views, error, path, picture, pose_from
 
 GUESS = guess_camera(640, 480)
@@ -168,19 +167,15 @@ def test_a_session_replaces_its_guessed_camera_while_it_tracks() -> None:
     focal_px = 600.0
     images, poses = clip(focal_px, 90)
     part = PartView(assembly_views())
-
-    def make(camera: Camera, start: Array | None) -> TrackingSession:
-        if start is None:
-            start = pose_seen_by(poses[0] @ part.model_from_body, true_camera(focal_px), camera) @ part.body_from_model
-        return TrackingSession(assembly_views(), camera, assembly(), initial_cam_from_model=start)
-
-    session = SelfCalibratingSession(make, assembly_views(), GUESS)
+    start = pose_seen_by(poses[0] @ part.model_from_body, true_camera(focal_px), GUESS) @ part.body_from_model
+    session = TrackingSession.of(assembly_views(), GUESS, assembly(), initial_cam_from_model=start, is_guessed=True)
+    assert session.camera_estimate is not None
     found = []
     for k, image in enumerate(images):
-        found.append(session.process(image, k, k / 30.0))
-        session.wait()
+        found += session.process(image, k, k / 30.0)
+        session.camera_estimate.wait()
     last = session.finish()
-    assert last.is_determined and last.focal_px == pytest.approx(focal_px, rel=0.015)
+    assert last is not None and last.is_determined and last.focal_px == pytest.approx(focal_px, rel=0.015)
     assert session.camera_of(0) is GUESS and session.camera.fx == pytest.approx(focal_px, rel=0.03)
     shifts_mm = [
         error(p.cam_from_model, truth)[0] for p, truth in zip(found, poses, strict=True) if p.cam_from_model is not None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 
 import cv2
 import numpy as np
@@ -11,14 +11,14 @@ import pytest
 
 from arview.cad import load_part
 from arview.errors import InputError
+from arview.fiducials.serial_code import SerialNumbers
 from arview.geometry import Array
 from arview.guideviews import GuideViewSet
 from arview.guideviews.cache import cached_guide_views
 from arview.pose import Pose, TrackingState
-from arview.tracking import TrackingSession
+from arview.tracking import SpecimenTracking, TrackedPart, TrackingSession
 from arview.tracking.search_plan import SEARCH_EVERY, SearchPlan
 from arview.tracking.session_state import SessionState
-from arview.tracking.several.sessions import SeveralSessions
 from arview.tracking.several.specimens import hide_specimens, is_same_specimen, searched_picture
 from arview.video import Image
 from helpers import two_specimens
@@ -36,10 +36,12 @@ def views() -> GuideViewSet:
     return cached_guide_views(part.model, part.effective_view_range)
 
 
-def two_sessions() -> SeveralSessions:
-    model, camera = load_part(str(PART)).model, two_specimens.wide_camera()
-    first = TrackingSession(views(), camera, model)
-    return SeveralSessions({"one": first, "two": TrackingSession(views(), camera, model, like=first)})
+def session_of(*parts: TrackedPart) -> TrackingSession:
+    return TrackingSession(parts, two_specimens.wide_camera())
+
+
+def tracked(name: str, of: GuideViewSet | None = None) -> TrackedPart:
+    return TrackedPart(of or views(), load_part(str(PART)).model, name)
 
 
 def error_mm(cam_from_model: Array, truth: Array) -> float:
@@ -71,7 +73,7 @@ def covered(image: Image) -> Image:
 
 @pytest.mark.slow
 def test_two_specimens_are_tracked_and_keep_their_names_through_an_occlusion() -> None:
-    several, seen = two_sessions(), []
+    several, seen = session_of(tracked("one"), tracked("two")), []
     frames = two_specimens.frames()
     for index, (image, truths) in enumerate([*frames, *frames[-2::-1]]):
         shown = covered(image) if index in COVERED else image
@@ -107,11 +109,9 @@ def test_a_hidden_specimen_is_not_in_the_picture_any_longer() -> None:
 @pytest.mark.slow
 def test_another_part_that_is_tracked_is_hidden_from_the_first_round_of_searches_only() -> None:
     """Guide views made anew stand for another part: it looks the same, and is found only where the first is not."""
-    part, camera = load_part(str(PART)), two_specimens.wide_camera()
-    own = views()
-    others = replace(own)
-    first, second = TrackingSession(own, camera, part.model), TrackingSession(others, camera, part.model)
-    several = SeveralSessions({"one": first, "two": second})
+    camera, others = two_specimens.wide_camera(), replace(views())
+    several = session_of(tracked("one"), tracked("two", others))
+    second = several.specimens[1].search
     frames = two_specimens.frames()
     for index, (image, _) in enumerate(frames[:4]):
         poses = several.process(image, index, index / 10.0)
@@ -125,8 +125,8 @@ def test_another_part_that_is_tracked_is_hidden_from_the_first_round_of_searches
     assert searched_picture(image, (), second.covers, others, camera) is not image
     assert searched_picture(image, (), (), others, camera) is image
     # Nor is a place hidden at which the other part is not sure.
-    several._poses["one"] = replace(several._poses["one"], state=TrackingState.CRITICAL)
-    assert several._covers("two") == ()
+    several._poses[0] = replace(several._poses[0], state=TrackingState.CRITICAL)
+    assert several._covers(1) == ()
 
 
 def test_specimens_are_told_apart_by_their_place() -> None:
@@ -137,8 +137,8 @@ def test_specimens_are_told_apart_by_their_place() -> None:
     assert is_same_specimen(left, moved, views())
 
 
-class ScriptedSession(TrackingSession):
-    """A session that is tracked from the first frame on, or finds nothing; it counts its frames."""
+class ScriptedSpecimen(SpecimenTracking):
+    """A specimen that is tracked from the first frame on, or never found; it counts its frames."""
 
     def __init__(self, is_found: bool) -> None:
         super().__init__(views(), two_specimens.wide_camera(), load_part(str(PART)).model)
@@ -148,7 +148,7 @@ class ScriptedSession(TrackingSession):
     def has_pose(self) -> bool:
         return self.is_found and self.calls > 0
 
-    def process(self, image: Image, index: int, time_s: float) -> Pose:
+    def process(self, image: Image, index: int, time_s: float, *_: object) -> Pose:
         self.calls += 1
         state = TrackingState.TRACKED if self.is_found else TrackingState.SEARCHING
         return Pose(np.eye(4) if self.is_found else None, None, 1.0, state, time_s, index)
@@ -156,8 +156,8 @@ class ScriptedSession(TrackingSession):
 
 @pytest.mark.slow
 def test_a_part_that_is_not_found_is_soon_searched_for_in_every_third_frame_only() -> None:
-    found, missing = ScriptedSession(True), ScriptedSession(False)
-    several = SeveralSessions({"found": found, "missing": missing})
+    several = session_of(tracked("found"), tracked("missing"))
+    several.specimens = found, missing = ScriptedSpecimen(True), ScriptedSpecimen(False)
     image = two_specimens.frames()[0][0]
     searched = []
     for index in range(36):
@@ -169,15 +169,28 @@ def test_a_part_that_is_not_found_is_soon_searched_for_in_every_third_frame_only
     assert 9 <= sum(searched[6:]) <= 11
 
 
-def test_sessions_of_different_cameras_are_refused() -> None:
-    model, camera = load_part(str(PART)).model, two_specimens.wide_camera()
-    other = camera.scaled(camera.width // 2, camera.height // 2)
-    with pytest.raises(InputError, match="same camera"):
-        SeveralSessions({"a": TrackingSession(views(), camera, model), "b": TrackingSession(views(), other, model)})
-    # Read twice it is the same camera.
-    again = replace(camera, dist=np.array(camera.dist))
-    assert again is not camera
-    both = {"a": TrackingSession(views(), camera, model), "b": TrackingSession(views(), again, model)}
-    assert len(SeveralSessions(both).sessions) == 2
-    with pytest.raises(InputError, match="no session"):
-        SeveralSessions({})
+def test_a_session_without_a_part_is_refused() -> None:
+    with pytest.raises(InputError, match="no part"):
+        session_of()
+
+
+def test_specimens_of_one_part_share_their_detector() -> None:
+    first, second = session_of(tracked("one"), tracked("two")).specimens
+    assert first.search.detector is second.search.detector and first.search.memory is not second.search.memory
+
+
+def test_each_specimen_is_confirmed_and_reset_by_itself(monkeypatch: pytest.MonkeyPatch) -> None:
+    session = session_of(tracked("one"), tracked("other"))
+    told: list[list[object]] = [[], []]
+    for specimen, calls in zip(session.specimens, told, strict=True):
+        monkeypatch.setattr(specimen, "confirm", partial(calls.append, "confirm"))
+        monkeypatch.setattr(specimen, "reset", partial(calls.append, "reset"))
+        monkeypatch.setattr(specimen.identity, "expect", calls.append)
+    session.confirm(1)
+    assert told == [[], ["confirm"]]
+    session.confirm()  # it is not known which one is meant
+    session.reset(0)
+    assert told == [["reset"], ["confirm"]]
+    session.reset()
+    session.expect([SerialNumbers("1"), None])
+    assert told == [["reset", "reset", SerialNumbers("1")], ["confirm", "reset", None]]

@@ -17,7 +17,7 @@ from arview.guideviews import GuideViewOptions, make_guide_views
 from arview.pose import Pose, TrackingState
 from arview.refinement.modalities.edge import smoothed
 from arview.refinement.schedules import TRACK_STAGES
-from arview.tracking import Estimate, Tracker, TrackerOptions, TrackingSession
+from arview.tracking import Estimate, SpecimenTracking, Tracker, TrackerOptions
 from arview.tracking.search.wide_search import WideSearch
 from helpers.synthetic import (
     CAMERA,
@@ -250,7 +250,7 @@ def test_quality_separates_right_from_wrong_poses() -> None:
 def hidden_run() -> tuple[list[Pose], list[Array]]:
     """70 frames: found and tracked for 20, hidden by a card for 30, in view again for 20."""
     poses = path(70, seed=3)
-    session = TrackingSession(assembly_views(), CAMERA, assembly())
+    session = SpecimenTracking(assembly_views(), CAMERA, assembly())
     results = []
     for i, pose in enumerate(poses):
         card = part_box(pose, margin_px=25) if 20 <= i < 50 else None
@@ -298,7 +298,7 @@ def test_there_is_no_pose_without_the_part() -> None:
         if not is_seen:
             assert result.quality == 0.0
             assert result.reason
-    session = TrackingSession(assembly_views(), CAMERA, assembly())
+    session = SpecimenTracking(assembly_views(), CAMERA, assembly())
     for i in range(4):
         result = session.process(picture(None, seed=i, scene=6), i, 0.0)
         assert (result.state, result.cam_from_model) == (TrackingState.SEARCHING, None)
@@ -310,7 +310,7 @@ def test_there_is_no_pose_without_the_part() -> None:
 
 @pytest.mark.slow
 def test_a_part_that_leaves_the_picture_is_lost() -> None:
-    session = TrackingSession(assembly_views(), CAMERA, assembly(), initial_cam_from_model=PATH[0])
+    session = SpecimenTracking(assembly_views(), CAMERA, assembly(), initial_cam_from_model=PATH[0])
     states = []
     for i in range(20):
         pose = PATH[0].copy()
@@ -326,7 +326,7 @@ def test_a_part_that_leaves_the_picture_is_lost() -> None:
 @pytest.mark.slow
 def test_an_initial_pose_is_refined() -> None:
     start = wrong(PATH[0], np.random.default_rng(1), 4.0, 8.0)
-    session = TrackingSession(assembly_views(), CAMERA, assembly(), initial_cam_from_model=start)
+    session = SpecimenTracking(assembly_views(), CAMERA, assembly(), initial_cam_from_model=start)
     result = session.process(clip()[0], 0, 0.0)
     assert result.state == TrackingState.TRACKED
     assert result.cam_from_model is not None
@@ -347,7 +347,7 @@ def test_an_initial_pose_is_refined() -> None:
     ids=["width", "turned", "gray", "alpha", "float"],
 )
 def test_a_wrong_image_is_refused(image: NDArray[np.uint8]) -> None:
-    session = TrackingSession(assembly_views(), CAMERA, assembly())
+    session = SpecimenTracking(assembly_views(), CAMERA, assembly())
     with pytest.raises(InputError, match=r"frame 7: .*expected \(480, 640, 3\) uint8"):
         session.process(image, 7, 0.0)
 
@@ -355,9 +355,9 @@ def test_a_wrong_image_is_refused(image: NDArray[np.uint8]) -> None:
 def test_guide_views_of_another_model_are_refused() -> None:
     coarse = GuideViewOptions(subdivisions=0, renderer="zbuffer")
     with pytest.raises(MismatchError, match=r"'bracket'.*'assembly'"):
-        TrackingSession(make_guide_views(bracket(), ViewRange((400.0, 700.0)), coarse), CAMERA, assembly())
+        SpecimenTracking(make_guide_views(bracket(), ViewRange((400.0, 700.0)), coarse), CAMERA, assembly())
 
 
 def test_invalid_poses_are_refused() -> None:
     with pytest.raises(InputError, match="initial pose"):
-        TrackingSession(assembly_views(), CAMERA, assembly(), initial_cam_from_model=2.0 * np.eye(4))
+        SpecimenTracking(assembly_views(), CAMERA, assembly(), initial_cam_from_model=2.0 * np.eye(4))

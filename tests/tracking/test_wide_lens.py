@@ -18,7 +18,7 @@ from arview.errors import InputError
 from arview.geometry import Array, apply, exp_so3, rigid
 from arview.overlay import OverlayOptions, OverlayRenderer
 from arview.pose import ComponentPresence, Pose, Presence, TrackingState, Visibility
-from arview.tracking.session import TrackingSession
+from arview.tracking import SpecimenTracking
 from helpers.synthetic import assembly, assembly_views, error, path, picture
 
 FISHEYE = Camera(1100, 800, 500.0, 501.0, 552.0, 398.0, lens=LensDistortion(LensModel.FISHEYE, (-0.02, 0.006, -0.003)))
@@ -54,7 +54,7 @@ def _scene_pixels(is_fisheye: bool) -> tuple[NDArray[np.float32], NDArray[np.flo
 @pytest.mark.slow
 @pytest.mark.parametrize("camera", [FISHEYE, RATIONAL], ids=["fisheye", "rational"])
 def test_part_is_found_and_tracked_far_off_the_axis(camera: Camera) -> None:
-    session = TrackingSession(assembly_views(), camera, assembly())
+    session = SpecimenTracking(assembly_views(), camera, assembly())
     assert session.frames.tracked_camera.lens is None
     truths = poses(8)
     tracked = 0
@@ -84,7 +84,7 @@ def test_detector_takes_pictures_of_a_wide_lens() -> None:
 
 @pytest.mark.parametrize("camera", [FISHEYE, RATIONAL], ids=["fisheye", "rational"])
 def test_edges_are_drawn_where_the_lens_shows_them(camera: Camera, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("arview.overlay.renderer.SHOW_ARROWS", False)
+    monkeypatch.setattr("arview.overlay.part_layers.SHOW_ARROWS", False)
     pose = poses(1)[0]
     options = OverlayOptions(show_ghost=False, show_labels=False, show_status=False)
     grey = np.full((camera.height, camera.width, 3), 118, dtype=np.uint8)

@@ -147,9 +147,10 @@ def write(path: Path, records: Iterator[Record]) -> None:
 
 def tracked_records(scene: Scene, name: str) -> Iterator[Record]:
     """The pose of each frame of a recorded sequence, from detection."""
-    session = TrackingSession(views=scene_guide_views(scene), model=scene.part.model, camera=scene.camera)
+    session = TrackingSession.of(scene_guide_views(scene), scene.camera, scene.part.model)
     for frame in watched(scene.frames, name):
-        yield pose_record(session.process(scene.image(frame), frame.index, frame.index / FPS))
+        (pose,) = session.process(scene.image(frame), frame.index, frame.index / FPS)
+        yield pose_record(pose)
 
 
 def pose_record(pose: Pose) -> Record:

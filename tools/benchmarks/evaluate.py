@@ -19,7 +19,7 @@ from arview.camera.read import load_camera
 from arview.errors import InputError
 from arview.geometry import Array, apply, exp_so3, rigid
 from arview.pose import Pose, TrackingState
-from arview.tracking import Tracker, TrackingSession
+from arview.tracking import SpecimenTracking, Tracker
 from arview_lab.evaluation import (
     FrameResult,
     PoseMeter,
@@ -317,7 +317,7 @@ def wrong_start_row(scene: Scene) -> ResultRow:
     converged = 0
     for _ in range(10):
         start = disturbed(truth, center, rng, 10.0, 0.0)
-        session = TrackingSession(views, scene.camera, scene.part.model, initial_cam_from_model=start)
+        session = SpecimenTracking(views, scene.camera, scene.part.model, initial_cam_from_model=start)
         for number, frame in enumerate(scene.frames[:3]):
             pose = session.process(scene.image(frame), frame.index, number / 30.0)
         if pose.cam_from_model is not None and frame.cam_from_model is not None:

@@ -60,8 +60,8 @@ def frame_path(session: TrackingSession, image: NDArray[np.uint8], index: int) -
     Raises:
         ArviewError: the part is not tracked, or its pose is not refined in this frame.
     """
-    if session.state is not TrackingState.TRACKED:
-        raise ArviewError(f"the part is {session.state}, not tracked, before the frame that is followed")
+    if session.specimens[0].state is not TrackingState.TRACKED:
+        raise ArviewError(f"the part is {session.specimens[0].state}, not tracked, before the frame that is followed")
     entered: set[Path] = set()
     chains: list[tuple[str, ...]] = []
     run_stages = kernels.run_stages
@@ -98,7 +98,7 @@ def sample_frame_path() -> FramePath:
     """The way of a frame of the sample clip: of those followed, the one that enters most folders."""
     part = load_part(SAMPLE / "part.toml")
     camera = load_camera(SAMPLE / "camera.json")
-    session = TrackingSession(cached_guide_views(part.model, part.effective_view_range), camera, part.model)
+    session = TrackingSession.of(cached_guide_views(part.model, part.effective_view_range), camera, part.model)
     paths: list[FramePath] = []
     with open_source(str(SAMPLE / "clip.mp4")) as source:
         for index, frame in enumerate(source):

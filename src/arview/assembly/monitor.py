@@ -214,10 +214,14 @@ class AssemblyMonitor:
         self._memory = LossMemory()
         self.reset()
 
-    def reset(self) -> None:
-        """Forget the observations since the part was found: another part may be in view."""
+    def reset(self, is_placed: bool = True) -> None:
+        """Forget the observations since the part was found: another part may be in view.
+
+        Args:
+            is_placed: whether the pose is known to be that of the part.
+        """
         self._turned.reset()
-        self.is_placed, self._is_resumed = True, False
+        self.is_placed, self._is_resumed = is_placed, False
         count = len(self._views.component_names)
         self._said: tuple[tuple[int, bool, bool, bytes], Mapping[str, ComponentPresence]] | None = None
         self._state = MonitorState(

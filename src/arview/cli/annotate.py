@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, cast
@@ -34,12 +34,10 @@ from arview.core.atomic import unfinished_path, writing_process
 from arview.errors import OutputError
 
 if TYPE_CHECKING:
-    from arview.annotation import AnnotateSummary, Overlay, Result, Session
+    from arview.annotation import AnnotateSummary
     from arview.cad import Part
     from arview.camera import Camera
     from arview.geometry import Array
-    from arview.inspection import Inspection
-    from arview.video import FrameSource, VideoSink
 
 
 NAMED_PART = f"{__name__}.named_part"
@@ -52,34 +50,6 @@ class _Outputs(NamedTuple):
     video: Path | None
     poses: Path | None
     learned: Path | None
-
-
-class _Run(NamedTuple):
-    """What a run reads and writes: frames, video and poses, the time stamps between which it goes, and its camera."""
-
-    frames: FrameSource
-    sink: VideoSink | None
-    poses: Path | None
-    span_s: tuple[float | None, ...]
-    camera_of: Callable[[int], Camera]
-    is_guessed: bool
-
-    def annotate(self, session: Session[Result], overlay: Overlay[Result] | None) -> AnnotateSummary:
-        """Track in all frames, and draw what the session returns."""
-        from arview.annotation import annotate as annotate_frames
-
-        with progress_bar("frames", self.frames.frame_count) as progress:
-            return annotate_frames(
-                self.frames,
-                session,
-                overlay,
-                self.sink,
-                self.poses,
-                progress=lambda done, pose: progress(done, self.frames.frame_count or 0),
-                start_s=self.span_s[0],
-                end_s=self.span_s[1],
-                camera_of=self.camera_of if self.is_guessed else None,
-            )
 
 
 def _parse_moment(ctx: click.Context, parameter: click.Parameter, value: str | None) -> int | float | None:
@@ -217,6 +187,8 @@ def annotate(
     unit: str | None,
 ) -> None:
     """Track the part in SOURCE (video, pictures, camera number, RTSP/HTTP address); write video and poses."""
+    from arview.annotation import FollowingOverlay
+    from arview.annotation import annotate as annotate_frames
     from arview.video import VideoSink, open_source
 
     check_profile(profile, camera_spec)
@@ -226,86 +198,52 @@ def annotate(
     specimens = workflow.load_specimens(part_paths, instances, inspection_paths, unit)
     if len(specimens) > 1:
         refuse_for_several({"--init": init, "--learned": learned_path, "--guideviews": views_path})
-    part = specimens[0].part
     guide_name = init.removeprefix(tracking.GUIDE_PREFIX) if init and init.startswith(tracking.GUIDE_PREFIX) else None
     init_path = init if guide_name is None else None
     first_pose = load_pose(init_path) if init_path else None
     files = [path for one in specimens for path in (one.part.path, one.part.cad_path)]
-    outputs = _check_outputs(
-        output, poses_path, learned_path, (source, *files, views_path, camera_spec, *inspection_paths, init_path)
-    )
+    inputs = source, *files, views_path, camera_spec, *inspection_paths, init_path
+    outputs = _check_outputs(output, poses_path, learned_path, inputs)
     drawing = _drawing_options(show_edges, no_ghost, no_labels, opacity)
     wanted = [moment if isinstance(moment, int) else None for moment in (start, end)]
+    is_guessed = camera_spec is None
     with open_source(source, start=wanted[0], end=wanted[1], stride=stride, fps=fps) as frames:
         camera = camera_for(frames, camera_spec, source)
-        views, guide = _views_and_guide(part, camera, views_path, renderer, guide_name)
-        make_session = partial(_session, specimens[0], views, session_options(modalities), guide, first_pose)
+        tracked = _tracked_parts(specimens, camera, views_path, renderer, guide_name, first_pose)
         keep = partial(report_estimate, profile=profile, source=source, turns=frames.quarter_turns_clockwise)
-        session, camera_of = start_session(make_session, frames, camera, camera_spec is None, views, keep)
+        session = start_session(tracked, frames, camera, session_options(modalities), keep if is_guessed else None)
         _load_learned(session, outputs.learned)
-        sink = None
+        sink, overlay = None, None
         if outputs.video is not None:
             sink = VideoSink(outputs.video, frames.width, frames.height, frames.fps, frames)
-        span = tuple(moment if isinstance(moment, float) else None for moment in (start, end))
-        run = _Run(frames, sink, outputs.poses, span, camera_of, camera_spec is None)
-        if len(specimens) > 1:
-            summary = _annotate_several(run, specimens, views, session_options(modalities), drawing, renderer)
-        else:
-            summary = _annotate_one(run, session, partial(_overlay, part, specimens[0].inspection, drawing))
-        if isinstance(session, tracking.SelfCalibratingSession) and len(specimens) == 1:
-            keep(session.finish())
+            overlay = FollowingOverlay(partial(workflow.make_overlay, specimens, drawing), session.camera_of)
+        with progress_bar("frames", frames.frame_count) as progress:
+            summary = annotate_frames(
+                frames,
+                session,
+                overlay,
+                sink,
+                outputs.poses,
+                progress=lambda done, pose: progress(done, frames.frame_count or 0),
+                start_s=start if isinstance(start, float) else None,
+                end_s=end if isinstance(end, float) else None,
+                camera_of=session.camera_of if is_guessed else None,
+            )
+        if (estimate := session.finish()) is not None:
+            keep(estimate)
     if sink is not None and sink.audio_note:
         say(f"warning: {sink.audio_note}")
     written = [path for path in (outputs.video, outputs.poses) if path is not None]
-    _print_summary(summary, written, frames.notes, camera_of(0) if camera_spec is None else None)
+    _print_summary(summary, written, frames.notes, session.camera_of(0) if is_guessed else None)
     _save_learned(session, outputs.learned)
     _exit_if_interrupted(ctx, summary)
     ctx.exit(presence_exit_code(summary) if check_presence else finding_exit_code(summary))
-
-
-def _annotate_one(
-    run: _Run,
-    session: tracking.TrackingSession | tracking.SelfCalibratingSession,
-    make: Callable[[Camera], overlays.OverlayRenderer],
-) -> AnnotateSummary:
-    """Track and draw one specimen."""
-    from arview import annotation
-
-    overlay = None if run.sink is None else annotation.FollowingOverlay(make, run.camera_of)
-    return run.annotate(session, overlay)
-
-
-def _annotate_several(
-    run: _Run,
-    specimens: Sequence[workflow.Specimen],
-    views: guideviews.GuideViewSet,
-    options: tracking.SessionOptions,
-    drawing: overlays.OverlayOptions,
-    renderer: str,
-) -> AnnotateSummary:
-    """Track and draw several specimens; guide views of the first part are given."""
-    camera = run.camera_of(0)
-
-    def views_of(part: Part) -> guideviews.GuideViewSet:
-        is_first = part.model.source_hash == specimens[0].part.model.source_hash
-        return views if is_first else _views_and_guide(part, camera, None, renderer, None)[0]
-
-    sessions = workflow.make_sessions(specimens, views_of, camera, options)
-    overlay = None if run.sink is None else workflow.make_overlay(specimens, drawing, camera)
-    return run.annotate(sessions, overlay)
 
 
 def _exit_if_interrupted(ctx: click.Context, summary: AnnotateSummary) -> None:
     if summary.is_interrupted:
         say("interrupted")
         ctx.exit(ExitCode.INTERRUPTED)
-
-
-def _overlay(
-    part: Part, inspection: Inspection | None, options: overlays.OverlayOptions, camera: Camera
-) -> overlays.OverlayRenderer:
-
-    return overlays.OverlayRenderer(part.model, camera, inspection, options, serial=part.serial)
 
 
 def _drawing_options(
@@ -358,45 +296,48 @@ def _views_and_guide(
     return views, guide
 
 
-def _session(
-    specimen: workflow.Specimen,
-    views: guideviews.GuideViewSet,
-    options: tracking.SessionOptions,
-    guide: Array | None,
-    first_pose: Array | None,
+def _tracked_parts(
+    specimens: Sequence[workflow.Specimen],
     camera: Camera,
-    start: Array | None,
-) -> tracking.TrackingSession:
-    """A session with a camera, that goes on from a pose (4,4) or else begins as the command says."""
-    session = tracking.TrackingSession(
-        views,
-        camera=camera,
-        model=specimen.part.model,
-        options=options,
-        initial_cam_from_model=first_pose if start is None else start,
-        guide_cam_from_model=guide,
-        serials=specimen.serials,
-    )
-    if (named := click.get_current_context().meta.get(NAMED_PART)) is not None:
-        session.name_at(*named)
-    return session
+    views_path: str | None,
+    renderer: str,
+    guide_name: str | None,
+    first_pose: Array | None,
+) -> list[tracking.TrackedPart]:
+    """The specimens for the session; guide views, guide view and first pose (4,4) are given for a single one only."""
+    named = click.get_current_context().meta.get(NAMED_PART)
+    is_single = len(specimens) == 1
+    views = {}
+    tracked = []
+    for specimen in specimens:
+        part = specimen.part
+        model = part.model.source_hash
+        if model not in views:
+            views[model] = _views_and_guide(part, camera, views_path, renderer, guide_name)
+        tracked.append(
+            tracking.TrackedPart(
+                views[model][0],
+                part.model,
+                "" if is_single else specimen.name,
+                specimen.serials,
+                initial_cam_from_model=first_pose,
+                guide_cam_from_model=views[model][1],
+                labels_at=named if is_single else None,
+            )
+        )
+    return tracked
 
 
-def _load_learned(session: tracking.TrackingSession | tracking.SelfCalibratingSession, path: Path | None) -> None:
+def _load_learned(session: tracking.TrackingSession, path: Path | None) -> None:
     if path is not None and path.exists():
-        _tracking(session).appearance_memory.load(path)
+        session.specimens[0].search.memory.load(path)
 
 
-def _save_learned(session: tracking.TrackingSession | tracking.SelfCalibratingSession, path: Path | None) -> None:
+def _save_learned(session: tracking.TrackingSession, path: Path | None) -> None:
     if path is not None:
-        memory = _tracking(session).appearance_memory
+        memory = session.specimens[0].search.memory
         memory.save(path)
         click.echo(f"wrote {path}: {len(memory)} learned views")
-
-
-def _tracking(session: tracking.TrackingSession | tracking.SelfCalibratingSession) -> tracking.TrackingSession:
-    """The session that tracks, within one that replaces its camera."""
-    return session.session if isinstance(session, tracking.SelfCalibratingSession) else session
 
 
 def _print_summary(summary: AnnotateSummary, written: list[Path], notes: Sequence[str], guessed: Camera | None) -> None:

@@ -28,10 +28,7 @@ from arview.station import capture as station
 from arview.station import walk
 
 if TYPE_CHECKING:
-    from arview.cad import Part
-    from arview.camera import Camera
     from arview.core.progress import StepProgress
-    from arview.geometry import Array
 
 SAID_EVERY_S = 3.0
 """Time between two lines that say where to go, with a camera."""
@@ -100,12 +97,14 @@ def capture(
                     guideviews.GuideViewOptions(renderer=renderer),
                     progress=progress,
                 )
-            make = partial(_session, part, views, first_pose)
             keep = partial(report_estimate, profile=None, source=source, turns=frames.quarter_turns_clockwise)
-            session, camera_of = start_session(make, frames, camera, camera_spec is None, views, keep)
+            tracked = tracking.TrackedPart(views, part.model, initial_cam_from_model=first_pose)
+            session = start_session([tracked], frames, camera, None, keep if camera_spec is None else None)
             with progress_bar("frames", frames.frame_count) as progress:
                 show = _Teller(frames.is_live, frames.frame_count or 0, progress)
-                summary = walk.capture_photos(frames, session, part, camera_of, job, walk.capture_options(count), show)
+                summary = walk.capture_photos(
+                    frames, session, part, session.camera_of, job, walk.capture_options(count), show
+                )
             if summary.photos and camera_spec is not None:
                 write_camera(camera, folder / "camera.json")
         finally:
@@ -128,15 +127,6 @@ def capture(
         ctx.exit(ExitCode.CANNOT_MEASURE)
     is_enough = summary.advice is not None and summary.advice.is_enough
     ctx.exit(ExitCode.DONE if is_enough else ExitCode.UNDECIDED)
-
-
-def _session(
-    part: Part, views: guideviews.GuideViewSet, first_pose: Array | None, camera: Camera, start: Array | None
-) -> tracking.TrackingSession:
-    """A session that starts at a rough pose (4,4), or searches."""
-    return tracking.TrackingSession(
-        views, camera=camera, model=part.model, initial_cam_from_model=first_pose if start is None else start
-    )
 
 
 def _remove(job: walk.JobFolder, was_there: bool) -> None:

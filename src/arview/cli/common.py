@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 
 import click
 
-from arview import guideviews, tracking
+from arview import tracking
 from arview.cli.exit_codes import ExitCode, group_rows, help_rows
 from arview.core.atomic import is_device
 from arview.core.plug_ins import find_plug_ins, load_plug_in
@@ -332,29 +332,31 @@ def camera_for(frames: FrameSource, spec: str | None, source: str) -> Camera:
 
 
 def start_session(
-    make_session: tracking.MakeSession,
+    parts: Sequence[tracking.TrackedPart],
     frames: FrameSource,
     camera: Camera,
-    is_guessed: bool,
-    views: guideviews.GuideViewSet,
-    keep: Callable[[tracking.FocalEstimate], None],
-) -> tuple[tracking.TrackingSession | tracking.SelfCalibratingSession, Callable[[int], Camera]]:
-    """The session for a source, and the camera of each of its frames by index.
+    options: tracking.SessionOptions | None,
+    keep: Callable[[tracking.FocalEstimate], None] | None,
+) -> tracking.TrackingSession:
+    """The session for a source.
 
-    A guessed camera is estimated: of a film in a first pass, of which ``keep`` gets the result, else while it runs.
+    Args:
+        parts: the specimens.
+        frames: the source.
+        camera: of its frames.
+        options: of the session.
+        keep: the camera is a guess: of a film it is estimated in a first pass with the first part, and this function
+            gets the result; otherwise it is estimated while the session runs. None: the camera is known.
     """
     from arview.annotation import estimate_camera
 
-    if not is_guessed:
-        return make_session(camera, None), lambda index: camera
-    following = tracking.SelfCalibratingSession(make_session, views, camera)
-    if frames.is_live:
-        return following, following.camera_of
+    if keep is None or frames.is_live:
+        return tracking.TrackingSession(parts, camera, options, is_guessed=keep is not None)
+    following = tracking.TrackingSession(parts[:1], camera, options, is_guessed=True)
     with progress_bar("focal length") as progress:
         estimate = estimate_camera(frames, following, lambda done: progress(done, frames.frame_count or 0))
     keep(estimate)
-    final = estimate.camera if estimate.is_determined else camera
-    return make_session(final, None), lambda index: final
+    return tracking.TrackingSession(parts, estimate.camera if estimate.is_determined else camera, options)
 
 
 def load_pose(path: str) -> Array:

@@ -26,9 +26,8 @@ if TYPE_CHECKING:
     from arview.overlay.options import EdgeMode as EdgeMode
     from arview.overlay.options import OverlayOptions as OverlayOptions
     from arview.overlay.renderer import OverlayRenderer as OverlayRenderer
-    from arview.overlay.several import SeveralOverlay as SeveralOverlay
-    from arview.overlay.several import specimen_mark as specimen_mark
-    from arview.overlay.several import specimen_rgb as specimen_rgb
+    from arview.overlay.renderer import specimen_mark as specimen_mark
+    from arview.overlay.renderer import specimen_rgb as specimen_rgb
     from arview.overlay.status import age_text as age_text
     from arview.overlay.status import completeness_text as completeness_text
 
@@ -65,9 +64,8 @@ __getattr__, __dir__, __all__ = lazy_door(
             "VERDICT_RGB",
             "VERDICT_WORD",
         ),
-        "renderer": ("OverlayRenderer",),
-        "several": (
-            "SeveralOverlay",
+        "renderer": (
+            "OverlayRenderer",
             "specimen_mark",
             "specimen_rgb",
         ),

@@ -1,86 +1,56 @@
-"""OverlayRenderer: draws model, inspection and status over a frame."""
+"""OverlayRenderer: draws model, inspection and status of one or many specimens over a frame.
+
+All specimens are drawn before the first label, so that no ghost covers a label, and the labels of all of them are laid
+out together. With several of them each has a tag with its name, and a label begins with the mark of its specimen.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Collection
-from dataclasses import dataclass
+import colorsys
+from collections.abc import Collection, Sequence
+from dataclasses import replace
 from datetime import datetime
 from types import NoneType
-from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from arview.cad import Model
 from arview.camera import Camera
 from arview.core.checks import check_type
 from arview.errors import MismatchError
-from arview.geometry import Array, apply
-from arview.inspection import ComponentDeviation, Inspection, Verdict
+from arview.geometry import apply
+from arview.inspection import Inspection
 from arview.overlay import labels, paint
-from arview.overlay.annotations import Annotations, LabelledComponent, LaidOut, WantedLabels
-from arview.overlay.displaced import DisplacedGhosts
-from arview.overlay.edges import Edges
-from arview.overlay.evidence import ComponentStyles, DrawnEvidence, component_styles, evidence_of, presence_of
-from arview.overlay.ghost import CELL_PX, NEAR_MM, Ghost, GhostView, blend, count_cells
-from arview.overlay.guide import GuideOutline
-from arview.overlay.legend import banner_sprite, legend_entries, legend_sprite, withheld_title
-from arview.overlay.mesh import anchor_in_model, topology
-from arview.overlay.occluders import HiddenComponents, OccluderFinder
-from arview.overlay.options import OverlayOptions
-from arview.overlay.status import StatusLine
-from arview.pose import ComponentPresence, Pose, TrackingState
+from arview.overlay.annotations import Annotations, LaidOut, WantedLabels
+from arview.overlay.options import OverlayOptions, Rgb
+from arview.overlay.part_layers import PartLayers
+from arview.pose import Pose
 
-SHOW_ARROWS = True
-"""Draw displacements as arrows."""
+_HUES = (0.58, 0.08, 0.83, 0.47, 0.92, 0.14)
+"""Hues of the specimens' tags, in turns; none is a colour of a verdict."""
+_MARK = "●▲■◆▼★"
+"""Marks of the tags, so that colour is never alone."""
 
-_SAME_PLACE = 0.02
-"""Distance in diameters within which a component is at one place in all ambiguous poses."""
-_CRITICAL_DIMMING = 0.55
-"""Factor of the opacity of ghost and edges in the state `critical`."""
-_PIECES = 16
-"""Pieces per diameter of the part into which edges are cut for a distorting lens: exact to about 0.2 px."""
-_HATCH = 7.0
-"""Distance of the lines of a hatched ghost, in widths of an edge."""
-_LEARNING_QUALITY = 0.5
-"""Quality of a pose from which on the colours of the part are learned."""
-_ARROW_RGB = (255, 255, 255)
+Drawn = Sequence[tuple[PartLayers, Pose]]
+"""The specimens of a picture with their poses."""
 
 
-@dataclass(frozen=True)
-class _PartLook:
-    """What is drawn of the components, as long as the evidence on them stays the same.
-
-    Attributes:
-        key: evidence on each component, and the doubt about the inspection.
-        evidence: the same by component.
-        styles: their appearance.
-        order: components that may get a label, the most urgent first.
-        arrows: (A,2,3) mm, tail and tip in the model frame.
-        texts: of the labels, by component and note; those of displaced components change from frame to frame.
-    """
-
-    key: tuple[tuple[DrawnEvidence, ...], str]
-    evidence: tuple[DrawnEvidence, ...]
-    styles: ComponentStyles
-    order: tuple[int, ...]
-    arrows: Array
-    texts: dict[tuple[int, str], labels.LabelText]
+def specimen_rgb(number: int) -> Rgb:
+    """Colour of the tag of a specimen, by its number from 0; it comes again after six."""
+    red, green, blue = colorsys.hsv_to_rgb(_HUES[number % len(_HUES)], 0.55, 1.0)
+    return round(255 * red), round(255 * green), round(255 * blue)
 
 
-class _PartInPicture(NamedTuple):
-    """What was drawn of the part in this picture: its view, the presence of its components, and their appearance."""
-
-    view: GhostView
-    presences: list[ComponentPresence | None]
-    scene: _PartLook
+def specimen_mark(number: int) -> str:
+    """Mark of the tag of a specimen, by its number from 0; it comes again after six."""
+    return _MARK[number % len(_MARK)]
 
 
 class OverlayRenderer:
-    """Draws ghosts, edges, labels, arrows and the status line for one model, camera and inspection.
+    """Draws ghosts, edges, labels, arrows and status lines for one camera.
 
     The places of labels depend on earlier frames, so each video needs a renderer of its own; it is not thread-safe. All
-    measured numbers in the picture are from the inspection; the pose determines where they are drawn, and whether they
+    measured numbers in the picture are from the inspections; the poses determine where they are drawn, and whether they
     are drawn at all.
 
     Attributes:
@@ -97,69 +67,61 @@ class OverlayRenderer:
         inspection: Inspection | None = None,
         options: OverlayOptions | None = None,
         *,
+        name: str = "",
         serial: str | None = None,
         pending: Collection[str] = (),
     ) -> None:
-        """Prepare the drawing.
+        """Prepare the drawing of one specimen; `add` gives others.
 
         Args:
             model, camera, inspection, options: what is drawn, and how.
+            name: of the specimen, see `Pose.instance`; empty for the only one.
             serial: serial number of the part in view, where it is known.
             pending: names of the components that are being measured: without a value, their labels say so.
         """
         check_type(model, Model, "OverlayRenderer: model")
         check_type(camera, Camera, "OverlayRenderer: camera")
         check_type(inspection, (Inspection, NoneType), "OverlayRenderer: inspection")
-        if inspection is not None:
-            inspection.check_model(model)
-        self.model, self.camera, self.inspection = model, camera, inspection
-        self.options, self._serial = options or OverlayOptions(), serial
-        shapes = [topology(component) for component in model.components]
-        self._ghost = Ghost(model, camera, shapes)
-        pieces_mm = model.diameter_mm / _PIECES if camera.is_distorted else None
-        self._edges = Edges(shapes, pieces_mm)
-        self._displaced = DisplacedGhosts(model, camera, shapes, pieces_mm)
-        self._anchors_in_model = np.stack(
-            [anchor_in_model(component, shape) for component, shape in zip(model.components, shapes, strict=True)]
-        )
-        self._centers_in_model = np.stack([one.bounds_in_model.mean(axis=0) for one in model.components])
-        self._line_px = max(1.0, 0.7 + camera.height / 800)
-        self._guide = GuideOutline(self._ghost, self._edges, self._line_px)
+        self.camera, self.options = camera, options or OverlayOptions()
         self._size_px = self.options.text_px or labels.text_size_px(camera.height)
-        self._arrow_scale = labels.arrow_scale(inspection, model.diameter_mm, self.options) if inspection else 1.0
-        self._names = tuple(component.name for component in model.components)
-        self._deviations = [inspection.find(name) if inspection else None for name in self._names]
-        found = zip(self._names, self._deviations, strict=True)
-        self._pending = frozenset(name for name, one in found if one is None and name in pending)
-        self._status = self._make_status()
-        bottom_px = camera.height - (self._status.height_px if self.options.show_status else 0)
-        self._annotations = self._make_annotations(bottom_px)
-        self._bottom_px = bottom_px
-        self._occluders = OccluderFinder(model, camera) if self.options.show_occlusion else None
-        self._hidden = HiddenComponents(len(self._names))
-        self._scene: _PartLook | None = None
+        self._layers: dict[str, PartLayers] = {}
         self.laid_out = LaidOut()
-        self._drawn: _PartInPicture | None = None
+        self.add(model, inspection, name=name, serial=serial, pending=pending)
+
+    def add(
+        self,
+        model: Model,
+        inspection: Inspection | None = None,
+        *,
+        name: str,
+        serial: str | None = None,
+        pending: Collection[str] = (),
+    ) -> None:
+        """Draw a further specimen of the same or another model; the arguments are those of the constructor."""
+        self._layers[name] = PartLayers(
+            model, self.camera, inspection, self.options, self._size_px, serial=serial, pending=pending
+        )
+        layers = list(self._layers.values())
+        bottom_px = status_px = self.camera.height - self.status_height_px
+        for part in layers:
+            status_px += part.status_height_px
+            part.stack(status_px, bottom_px)
+        self._bottom_px = bottom_px
+        texts = layers[0].usual_texts() if len(layers) == 1 else []
+        most = len(layers) * self.options.max_labels
+        self._annotations = Annotations(self.camera, self._size_px, texts, most, bottom_px)
+        self._marks = {name: specimen_mark(number) for number, name in enumerate(self._layers)}
+        self._tags = {name: self._tag(number, name) for number, name in enumerate(self._layers)}
 
     @property
     def status_height_px(self) -> int:
-        """Height of the status line; 0 without one."""
-        return self._status.height_px if self.options.show_status else 0
-
-    def stack(self, status_bottom_px: int, bottom_px: int) -> None:
-        """Leave room for the status lines of other parts.
-
-        Args:
-            status_bottom_px: row at which the own status line ends.
-            bottom_px: row above which everything else must stay.
-        """
-        self._status.bottom_px = status_bottom_px
-        self._bottom_px = bottom_px
+        """Height of all status lines; 0 without them."""
+        return sum(part.status_height_px for part in self._layers.values())
 
     def draw(
         self,
         image: paint.Image,
-        pose: Pose,
+        pose: Pose | Sequence[Pose],
         fps: float | None = None,
         now: datetime | None = None,
         in_place: bool = False,
@@ -168,312 +130,80 @@ class OverlayRenderer:
 
         Args:
             image: (H,W,3) uint8 RGB, of the camera's size.
-            pose: of this frame; without ``cam_from_model`` only the status line is drawn, and the outline at its
-                ``guide_cam_from_model`` if it has one.
+            pose: of each specimen in this frame, with its name; or of the only one. Without ``cam_from_model`` only the
+                status line is drawn, and the outline at its ``guide_cam_from_model`` if it has one.
             fps: frame rate to show; None: not shown.
-            now: time from which the age of the inspection is computed; None: the current time.
+            now: time from which the age of the inspections is computed; None: the current time.
             in_place: draw on the image itself, which must be writable, instead of a copy.
 
         Raises:
             MismatchError: the image is not of the camera's size.
         """
         canvas = image if in_place else np.array(image, order="C")
-        self.draw_part(canvas, pose, now)
-        self.draw_texts(canvas, pose, fps, now)
-        return canvas
-
-    def draw_part(
-        self, canvas: paint.Image, pose: Pose, now: datetime | None = None, frame: paint.Image | None = None
-    ) -> None:
-        """Draw ghosts and edges on a picture in place; `draw_texts` follows.
-
-        Args:
-            canvas: (H,W,3) uint8 RGB.
-            pose: of this frame.
-            now: time from which the age of the inspection is computed; None: the current time.
-            frame: the picture without anything drawn on it; None: the canvas is.
-
-        Raises:
-            MismatchError: the picture is not of the camera's size.
-        """
         expected = (self.camera.height, self.camera.width, 3)
         if canvas.shape != expected or canvas.dtype != np.uint8:
             raise MismatchError(f"overlay: image is {canvas.dtype} {canvas.shape}, the camera expects uint8 {expected}")
-        view = self._ghost.view(pose.cam_from_model) if pose.cam_from_model is not None else None
-        self._drawn = None
-        if view is not None:
-            presences = self._presences(pose)
-            scene = self._scene_of(pose, presences, now)
-            self._drawn = _PartInPicture(view, presences, scene)
-            occluder = self._find_occluder(canvas if frame is None else frame, view, pose, scene)
-            self._hidden.update(view, occluder, presences)
-            self._draw_model(canvas, view, pose, scene, presences, occluder)
-
-    def draw_texts(
-        self,
-        canvas: paint.Image,
-        pose: Pose,
-        fps: float | None = None,
-        now: datetime | None = None,
-    ) -> None:
-        """Draw labels, arrows, legend and status line on a picture in place, after `draw_part` of the same pose.
-
-        Args:
-            canvas: (H,W,3) uint8 RGB.
-            pose: of this frame.
-            fps: frame rate to show; None: not shown.
-            now: time from which the age of the inspection is computed; None: the current time.
-        """
-        bottom_px = self.draw_legend(canvas)
-        self.laid_out = self._annotations.draw_leaders(canvas, self.wanted_labels(pose), bottom_px)
-        self.draw_arrows(canvas, pose)
+        poses = [pose] if isinstance(pose, Pose) else pose
+        only = next(iter(self._layers.values())) if len(self._layers) == 1 else None
+        drawn = [(only or self._layers[one.instance], one) for one in poses]
+        frame = _unpainted(image, canvas, drawn)
+        for part, found in drawn:
+            part.draw_model(canvas, found, now, frame)
+        bottom_px = min(part.draw_legend(canvas) for part, _ in drawn)
+        self.laid_out = self._annotations.draw_leaders(canvas, self._wanted(drawn), bottom_px)
+        for part, found in drawn:
+            part.draw_arrows(canvas, found)
+            if only is None:
+                self._draw_tag(canvas, part, found)
         self._annotations.draw_labels(canvas, self.laid_out)
-        self.draw_state(canvas, pose, fps, now)
+        for number, (part, found) in enumerate(drawn):
+            part.draw_state(canvas, found, fps if number == 0 else None, now)
+        return canvas
 
-    def wanted_labels(self, pose: Pose) -> WantedLabels | None:
-        """Labels of the part that `draw_part` has drawn; None where it has none."""
-        if self._drawn is None or not self._drawn.scene.order:
+    def _wanted(self, drawn: Drawn) -> WantedLabels | None:
+        """Labels of all specimens; those of several have marks, and the urgent ones of all come first."""
+        if len(self._layers) == 1:
+            return drawn[0][0].wanted_labels(drawn[0][1])
+        some = [(self._marks[pose.instance], part.wanted_labels(pose)) for part, pose in drawn]
+        found = [(mark, wanted) for mark, wanted in some if wanted is not None]
+        if not found:
             return None
-        view, presences, scene = self._drawn
-        components, cells = self._labelled(view, pose, scene, presences)
-        return WantedLabels(components, (float(view.u0), float(view.u0 + view.face_ids.shape[1])), cells)
-
-    def draw_legend(self, canvas: paint.Image) -> int:
-        """Draw the legend above the status line if it is needed; returns the row above which labels must stay."""
-        entries = legend_entries(self._drawn.scene.evidence) if self._drawn and self.options.show_legend else ()
-        if not entries:
-            return self._bottom_px
-        margin = round(0.4 * self._size_px)
-        sprite = legend_sprite(entries, self._size_px, self.camera.width - 2 * margin)
-        top = self._bottom_px - margin - sprite.height
-        paint.put_sprite(canvas, sprite, margin, top)
-        return top
-
-    def draw_arrows(self, canvas: paint.Image, pose: Pose) -> None:
-        """Draw the arrows of measured displacements, and those to where displaced components are seen."""
-        if self._drawn is not None and pose.cam_from_model is not None:
-            _, presences, scene = self._drawn
-            self._draw_displacements(canvas, pose.cam_from_model, scene.arrows)
-            self._draw_links(canvas, pose.cam_from_model, scene, presences)
-
-    def draw_state(
-        self, canvas: paint.Image, pose: Pose, fps: float | None = None, now: datetime | None = None
-    ) -> None:
-        """Draw the status line, why labels are withheld, and the outline of the guide pose."""
-        if pose.cam_from_model is None and pose.guide_cam_from_model is not None:
-            self._guide.draw(canvas, pose.guide_cam_from_model)
-        if pose.is_label_withheld and self.options.show_evidence:
-            self._draw_banner(canvas, pose)
-        if self.options.show_status:
-            self._status.draw(canvas, pose, fps, now)
-
-    def _make_status(self) -> StatusLine:
-        arrows = self._arrows_in_model([DrawnEvidence.SEEN] * len(self._names))
-        return StatusLine(
-            self.camera.width,
-            self.camera.height,
-            round(0.95 * self._size_px),
-            self.inspection,
-            self._arrow_scale if SHOW_ARROWS and len(arrows) else None,
-            len(self._names) > 1 and self.options.show_evidence,
-            bool(self._pending),
-        )
-
-    def _make_annotations(self, bottom_px: int) -> Annotations:
-        texts = [
-            labels.label_text(deviation.name, deviation, None, self.options)
-            for deviation in self._deviations
-            if deviation is not None and self.options.show_labels
+        ranked = [
+            (not one.text.is_urgent, rank, replace(one, text=replace(one.text, name=f"{mark} {one.text.name}")))
+            for mark, wanted in found
+            for rank, one in enumerate(wanted.components)
         ]
-        if self.options.show_labels:
-            pending = sorted(self._pending)
-            texts += [labels.label_text(name, None, None, self.options, is_pending=True) for name in pending]
-        return Annotations(self.camera, self._size_px, texts, self.options.max_labels, bottom_px)
+        # In turns, so that each specimen gets its share of the room.
+        components = [one for _, _, one in sorted(ranked, key=lambda of: of[:2])]
+        first, last = zip(*(wanted.part_px for _, wanted in found), strict=True)
+        cells = np.sum([wanted.cells for _, wanted in found], axis=0)
+        return WantedLabels(components, (min(first), max(last)), cells)
 
-    def _presences(self, pose: Pose) -> list[ComponentPresence | None]:
-        """Presence of each component; None if it is not checked."""
-        if not self.options.show_evidence:
-            return [None] * len(self._names)
-        return [presence_of(pose, name, len(self._names)) for name in self._names]
+    def _tag(self, number: int, name: str) -> paint.Sprite:
+        """Sprite with mark, number and name of a specimen."""
+        color = specimen_rgb(number)
+        text = paint.text_mask(f"{self._marks[name]} {name}", self._size_px, True)
+        pad = round(0.4 * self._size_px)
+        sprite = paint.panel(text.shape[1] + 2 * pad, text.shape[0] + pad, 0.3 * self._size_px, 0.85)
+        paint.write(sprite, text, pad, pad // 2, color)
+        return sprite
 
-    def _scene_of(self, pose: Pose, presences: list[ComponentPresence | None], now: datetime | None) -> _PartLook:
-        """What is drawn of the components; computed again when the evidence changes."""
-        is_withheld = pose.is_label_withheld and self.options.show_evidence
-        evidence = tuple(evidence_of(presence, is_withheld) for presence in presences)
-        doubt = labels.inspection_doubt(self.inspection, self._serial, self.options, now) if self.inspection else ""
-        key = evidence, doubt
-        if self._scene is None or self._scene.key != key:
-            styles = component_styles(self.model, self.inspection, self.options, evidence, bool(doubt))
-            by_name = dict(zip(self._names, evidence, strict=True))
-            index = {name: number for number, name in enumerate(self._names)}
-            wanted = labels.text_urgency(self._names, self.inspection, by_name, self._pending)
-            order = tuple(index[name] for name in wanted) if self.options.show_labels and not is_withheld else ()
-            arrows = self._arrows_in_model(list(evidence)) if SHOW_ARROWS else np.zeros((0, 2, 3))
-            self._scene = _PartLook(key, evidence, styles, order, arrows, {})
-        return self._scene
+    def _draw_tag(self, canvas: paint.Image, part: PartLayers, pose: Pose) -> None:
+        """Draw the tag at the specimen's centre."""
+        sprite = self._tags[pose.instance]
+        if pose.cam_from_model is not None:
+            center = apply(pose.cam_from_model, part.model.center_in_model)
+            if center[2] > 0:
+                u, v = self.camera.project(center)
+                x = round(float(np.clip(u - 0.5 * sprite.width, 0, self.camera.width - sprite.width)))
+                y = round(float(np.clip(v - 0.5 * sprite.height, 0, self._bottom_px - sprite.height)))
+                paint.put_sprite(canvas, sprite, x, y, 0.9)
 
-    def _draw_model(
-        self,
-        canvas: paint.Image,
-        view: GhostView,
-        pose: Pose,
-        scene: _PartLook,
-        presences: list[ComponentPresence | None],
-        occluder: NDArray[np.bool_] | None,
-    ) -> None:
-        assert pose.cam_from_model is not None
-        options, styles = self.options, scene.styles
-        if options.show_edges == "none":
-            cover = np.zeros(view.face_ids.shape, dtype=np.uint8)
-            owner = np.zeros(view.face_ids.shape, dtype=np.int16)
-        else:
-            cover, owner = self._edges.draw(
-                self._ghost, view, pose.cam_from_model, self._line_px, options.show_edges == "all", styles.dashed
-            )
-        face_ids = view.face_ids
-        if occluder is not None:
-            face_ids = np.where(occluder, np.int32(-1), face_ids)
-            cover[occluder] = 0
-        is_critical = pose.state is TrackingState.CRITICAL
-        dimming = np.ones((len(scene.evidence), 4), dtype=np.float32)
-        if is_critical:
-            # What was seen to be missing or displaced is shown in full, because it may be why the pose is critical.
-            dimming[[not seen.is_refuted for seen in scene.evidence], 3] = _CRITICAL_DIMMING
-        blend(
-            canvas,
-            view.u0,
-            view.v0,
-            face_ids=face_ids,
-            shade=view.shade,
-            components=view.components,
-            ghost_style=styles.ghost * dimming,
-            edge_cover=cover,
-            edge_owner=owner,
-            edge_style=styles.edges * dimming,
-            patterns=styles.patterns,
-            hatch_px=self._hatch_px,
-        )
-        for index, seen in enumerate(scene.evidence):
-            presence = presences[index]
-            if seen is DrawnEvidence.DISPLACED and presence is not None and presence.model_from_nominal is not None:
-                moved = pose.cam_from_model @ presence.model_from_nominal
-                opacity = options.opacity if options.show_ghost else 0.0
-                line_px = 0.0 if options.show_edges == "none" else self._line_px
-                self._displaced.draw(canvas, view, index, moved, opacity, line_px)
 
-    @property
-    def _hatch_px(self) -> int:
-        return max(6, round(_HATCH * self._line_px))
-
-    def _labelled(
-        self, view: GhostView, pose: Pose, scene: _PartLook, presences: list[ComponentPresence | None]
-    ) -> tuple[list[LabelledComponent], NDArray[np.float32]]:
-        """Components that may get a label, and the weighted covered area of each cell of the picture."""
-        assert pose.cam_from_model is not None
-        camera = self.camera
-        cells = np.zeros((-(-camera.height // CELL_PX), -(-camera.width // CELL_PX)), dtype=np.float32)
-        seen_px = np.zeros(len(self._names), dtype=np.int64)
-        count_cells(view.u0, view.v0, view.face_ids, view.components, scene.styles.weight, cells, seen_px)
-        anchors_in_cam = apply(pose.cam_from_model, self._anchors_in_model)
-        anchors_px = self._ghost.project(anchors_in_cam)
-        notes = self._open_notes(pose)
-        result = []
-        for index in scene.order:
-            note = notes.get(index) or (labels.OCCLUDED if self._hidden.flags[index] else "")
-            text = self._text(index, presences[index], scene, note)
-            result.append(LabelledComponent(text, anchors_px[index], anchors_in_cam[index], int(seen_px[index])))
-        return result, cells
-
-    def _text(self, index: int, presence: ComponentPresence | None, scene: _PartLook, note: str) -> labels.LabelText:
-        """Texts of a component's label."""
-        text = scene.texts.get((index, note))
-        if text is None or scene.evidence[index] is DrawnEvidence.DISPLACED:
-            text = labels.label_text(
-                self._names[index],
-                self._deviations[index],
-                presence,
-                self.options,
-                center_in_model=self._centers_in_model[index],
-                doubt=scene.key[1],
-                note=note,
-                is_pending=self._names[index] in self._pending,
-            )
-            scene.texts[index, note] = text
-        return text
-
-    def _find_occluder(
-        self, canvas: paint.Image, view: GhostView, pose: Pose, scene: _PartLook
-    ) -> NDArray[np.bool_] | None:
-        """Pixels (h,w) of the view that something before the part covers; None if there is nothing."""
-        if self._occluders is None or pose.cam_from_model is None:
-            return None
-        learns = pose.state is TrackingState.TRACKED and pose.quality >= _LEARNING_QUALITY
-        absent = np.array([seen.is_refuted for seen in scene.evidence])
-        return self._occluders.find(canvas, view, pose.cam_from_model, learns, absent)
-
-    def _open_notes(self, pose: Pose) -> dict[int, str]:
-        """Notes on the components, by index, whose place depends on which of the ambiguous poses is right."""
-        if pose.cam_from_model is None or not pose.alternatives:
-            return {}
-        anchors = apply(pose.cam_from_model, self._anchors_in_model)
-        moved = [apply(other, self._anchors_in_model) - anchors for other in pose.alternatives]
-        apart = np.max(np.linalg.norm(moved, axis=2), axis=0) > _SAME_PLACE * self.model.diameter_mm
-        count = len(pose.alternatives) + 1
-        note = "one of two places" if count == 2 else f"one of {count} places"
-        return {int(index): note for index in np.flatnonzero(apart)}
-
-    def _draw_banner(self, canvas: paint.Image, pose: Pose) -> None:
-        margin = round(0.6 * self._size_px)
-        width_px = self.camera.width - 2 * margin
-        sprite = banner_sprite(withheld_title(pose), pose.identity_reason, self._size_px, width_px)
-        paint.put_sprite(canvas, sprite, (self.camera.width - sprite.width) // 2, margin)
-
-    def _arrows_in_model(self, evidence: list[DrawnEvidence]) -> Array:
-        """Tail and exaggerated tip (A,2,3) of the arrows in the model frame, mm, the most urgent last.
-
-        Components have none that were seen to be elsewhere, are not verified, or whose measurement is withheld.
-        """
-        arrows = []
-        seen = dict(zip(self._names, evidence, strict=True))
-        urgent: list[ComponentDeviation] = labels.by_urgency(self.inspection) if self.inspection else []
-        for deviation in reversed(urgent):
-            displacement = labels.arrow_in_model(deviation)
-            is_shown = seen.get(deviation.name) is DrawnEvidence.SEEN and deviation.verdict is not Verdict.PASS
-            if displacement is not None and is_shown:
-                tail = self.model.component(deviation.name).bounds_in_model.mean(axis=0)
-                arrows.append(np.stack([tail, tail + self._arrow_scale * np.array(displacement)]))
-        return np.stack(arrows) if arrows else np.zeros((0, 2, 3))
-
-    def _draw_displacements(self, canvas: paint.Image, cam_from_model: Array, arrows: Array) -> None:
-        for tail_px, tip_px in self._projected(cam_from_model, arrows):
-            paint.arrow(canvas, tail_px, tip_px, _ARROW_RGB, 0.24 * self._size_px)
-
-    def _draw_links(
-        self,
-        canvas: paint.Image,
-        cam_from_model: Array,
-        scene: _PartLook,
-        presences: list[ComponentPresence | None],
-    ) -> None:
-        """Arrows from the nominal places of displaced components to where they are seen."""
-        links = [
-            np.stack([center, apply(presence.model_from_nominal, center[None])[0]])
-            for center, presence, seen in zip(self._centers_in_model, presences, scene.evidence, strict=True)
-            if seen is DrawnEvidence.DISPLACED and presence is not None and presence.model_from_nominal is not None
-        ]
-        if links:
-            for tail_px, tip_px in self._projected(cam_from_model, np.stack(links)):
-                paint.arrow(canvas, tail_px, tip_px, self._displaced.color, 0.3 * self._size_px)
-
-    def _projected(self, cam_from_model: Array, ends_in_model: Array) -> list[Array]:
-        """Ends (2,2) px of those arrows (A,2,3) that lie in front of the camera and near the picture."""
-        if not len(ends_in_model):
-            return []
-        ends_in_cam = apply(cam_from_model, ends_in_model)
-        ends_px = self._ghost.project(ends_in_cam)
-        limit_px = 2 * max(self.camera.width, self.camera.height)
-        return [
-            ends
-            for in_cam, ends in zip(ends_in_cam, ends_px, strict=True)
-            if in_cam[:, 2].min() > NEAR_MM and np.abs(ends).max() < limit_px
-        ]
+def _unpainted(image: paint.Image, canvas: paint.Image, drawn: Drawn) -> paint.Image | None:
+    """The picture in which occluders of the second and later parts are searched; None if none are searched."""
+    in_view = [part for part, pose in drawn if pose.cam_from_model is not None]
+    if not any(part.options.show_occlusion for part in in_view[1:]):
+        return None
+    # An image that is not drawn on stays as it is.
+    return image.copy() if canvas is image else np.ascontiguousarray(image)

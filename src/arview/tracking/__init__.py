@@ -10,12 +10,11 @@ if TYPE_CHECKING:
     from arview.tracking.guide_pose import GUIDE_PREFIX as GUIDE_PREFIX
     from arview.tracking.self_calibration.estimator import FocalEstimate as FocalEstimate
     from arview.tracking.self_calibration.profile import keep_profile as keep_profile
-    from arview.tracking.self_calibration.session import MakeSession as MakeSession
-    from arview.tracking.self_calibration.session import SelfCalibratingSession as SelfCalibratingSession
+    from arview.tracking.session import TrackedPart as TrackedPart
     from arview.tracking.session import TrackingSession as TrackingSession
     from arview.tracking.session_options import SessionOptions as SessionOptions
-    from arview.tracking.several.sessions import SeveralSessions as SeveralSessions
     from arview.tracking.several.specimens import specimen_names as specimen_names
+    from arview.tracking.specimen import SpecimenTracking as SpecimenTracking
     from arview.tracking.tracker import Tracker as Tracker
     from arview.tracking.tracker_options import TrackerOptions as TrackerOptions
 
@@ -27,14 +26,13 @@ __getattr__, __dir__, __all__ = lazy_door(
         "guide_pose": ("GUIDE_PREFIX",),
         "self_calibration.estimator": ("FocalEstimate",),
         "self_calibration.profile": ("keep_profile",),
-        "self_calibration.session": (
-            "MakeSession",
-            "SelfCalibratingSession",
+        "session": (
+            "TrackedPart",
+            "TrackingSession",
         ),
-        "session": ("TrackingSession",),
         "session_options": ("SessionOptions",),
-        "several.sessions": ("SeveralSessions",),
         "several.specimens": ("specimen_names",),
+        "specimen": ("SpecimenTracking",),
         "tracker": ("Tracker",),
         "tracker_options": ("TrackerOptions",),
     },

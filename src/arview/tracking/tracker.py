@@ -168,6 +168,10 @@ class Tracker:
             raise RuntimeError("Tracker.track was called before Tracker.start")
         return self._state
 
+    def expect(self, part: PartView) -> None:
+        """Track with other guide views of the part from now on, which lack the lines of absent components."""
+        self.refiner.part = part
+
     def start(self, image: NDArray[np.uint8], cam_from_model: Array) -> None:
         """Start at a pose (4,4): colours are learned from this frame (H,W,3) uint8 RGB, and no motion is expected."""
         state = self._state = TrackerState(cam_from_model @ self.refiner.part.model_from_body)

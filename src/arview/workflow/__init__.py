@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from arview.workflow.specimens import Specimen as Specimen
     from arview.workflow.specimens import load_specimens as load_specimens
     from arview.workflow.specimens import make_overlay as make_overlay
-    from arview.workflow.specimens import make_sessions as make_sessions
 
 __getattr__, __dir__, __all__ = lazy_door(
     __name__,
@@ -47,7 +46,6 @@ __getattr__, __dir__, __all__ = lazy_door(
             "Specimen",
             "load_specimens",
             "make_overlay",
-            "make_sessions",
         ),
     },
 )

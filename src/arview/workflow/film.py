@@ -71,7 +71,7 @@ def make_film(
             total = frames.frame_count or 0
             summary = annotation.annotate(
                 frames,
-                tracking.TrackingSession(views, camera, part.model),
+                tracking.TrackingSession.of(views, camera, part.model),
                 overlay.OverlayRenderer(part.model, camera, inspection),
                 VideoSink(unfinished[0], frames.width, frames.height, frames.fps, frames),
                 unfinished[1],

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
-from arview import guideviews, overlay, tracking
+from arview import overlay as overlays
+from arview import tracking
 from arview.errors import InputError
 
 if TYPE_CHECKING:
@@ -60,32 +61,12 @@ def load_specimens(
     return [Specimen(*of) for of in zip(names, parts, inspections, strict=True)]
 
 
-def make_sessions(
-    specimens: Sequence[Specimen],
-    views_of: Callable[[Part], guideviews.GuideViewSet],
-    camera: Camera,
-    options: tracking.SessionOptions,
-) -> tracking.SeveralSessions:
-    """A session for each specimen; those of one part share guide views and detector."""
-    first: dict[str, tracking.TrackingSession] = {}
-    sessions = {}
-    for specimen in specimens:
-        part = specimen.part
-        like = first.get(part.model.source_hash)
-        views = views_of(part) if like is None else like.views
-        session = tracking.TrackingSession(views, camera, part.model, options, like=like, serials=specimen.serials)
-        first.setdefault(part.model.source_hash, session)
-        sessions[specimen.name] = session
-    return tracking.SeveralSessions(sessions)
-
-
 def make_overlay(
-    specimens: Sequence[Specimen], options: overlay.OverlayOptions, camera: Camera
-) -> overlay.SeveralOverlay:
+    specimens: Sequence[Specimen], options: overlays.OverlayOptions, camera: Camera
+) -> overlays.OverlayRenderer:
     """The drawing of all specimens in one picture."""
-    return overlay.SeveralOverlay(
-        {
-            name: overlay.OverlayRenderer(part.model, camera, inspection, options, serial=part.serial)
-            for name, part, inspection in specimens
-        }
-    )
+    (name, part, inspection), *others = specimens
+    overlay = overlays.OverlayRenderer(part.model, camera, inspection, options, name=name, serial=part.serial)
+    for name, part, inspection in others:
+        overlay.add(part.model, inspection, name=name, serial=part.serial)
+    return overlay

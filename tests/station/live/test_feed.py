@@ -46,10 +46,10 @@ from helpers.live_sample import INSPECTION, PART, options
 class Session:
     """A session with a given duration per frame, a constant pose and a failure on demand."""
 
-    camera = estimate = None
+    estimate = None
 
-    def __init__(self, subject: Scripted) -> None:
-        self.subject = subject
+    def __init__(self, subject: Scripted, camera: Camera) -> None:
+        self.subject, self.camera = subject, camera
 
     def expect(self, serials: list[SerialNumbers | None]) -> None:
         self.subject.expected += serials
@@ -100,7 +100,7 @@ class Scripted(list[Any]):
 
     def session(self, camera: Camera) -> Session:
         self.sessions += 1
-        return Session(self)
+        return Session(self, camera)
 
     def overlay(self, camera: Camera, style: OverlayStyle) -> Overlay:
         self.overlays += 1

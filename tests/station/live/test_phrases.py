@@ -15,7 +15,7 @@ from arview.station.capture import words
 from arview.station.live.stream.phrases import CATALOGUE, messages_of, with_messages
 from arview.station.walk import worker
 from arview.tracking import diagnosis
-from arview.tracking.identity import monitor
+from arview.tracking.identity import doubt, monitor
 
 NO_SENTENCES = {"", "; ", "left", "right", "upper", "lower"}
 
@@ -51,7 +51,8 @@ def texts_in(node: ast.expr) -> list[str]:
     ("module", "functions", "names", "least"),
     [
         (diagnosis, "diagnose|outside_range|_too_|_partly|_low_contrast", "", 14),
-        (monitor, "_result|_take_serial|_follow_named|.", "^(CHECKING|ANOTHER_IN_VIEW|MOVED)$", 6),
+        (monitor, "_result|_take_serial|_follow_named|.", "^CHECKING$", 4),
+        (doubt, "^$", "^(ANOTHER_IN_VIEW|MOVED)$", 2),
     ],
 )
 def test_reasons_of_the_tracking_are_in_the_catalogue(

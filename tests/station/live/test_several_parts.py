@@ -6,14 +6,11 @@ import json
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 
 from arview.errors import InputError
-from arview.fiducials.serial_code import SerialNumbers
 from arview.geometry import rigid
 from arview.pose import Identity, Pose, TrackingState
 from arview.station.live.security.refusals import Refusal
@@ -23,7 +20,6 @@ from arview.station.live.stream.annotator import FrameAnnotator
 from arview.station.live.stream.documents import parts_document, pose_document, with_ages
 from arview.station.live.stream.feed import TrackedFrame
 from arview.station.live.stream.frames import DecodedFrame
-from arview.station.live.stream.sessions import SeveralPartsSession
 from arview.station.live.stream.subject import OverlayStyle
 from arview.station.live.stream.subjects import Subjects
 from helpers.live_client import Http, running
@@ -128,33 +124,6 @@ def test_a_control_request_names_the_part_it_means() -> None:
     ):  # fmt: skip
         with pytest.raises(Refusal):
             check_control(wrong, style, names)
-
-
-class Counting:
-    """A session that counts what it is told."""
-
-    def __init__(self) -> None:
-        self.told: list[Any] = []
-        self.identity = SimpleNamespace(expect=self.told.append)
-
-    def confirm(self) -> None:
-        self.told.append("confirm")
-
-    def reset(self) -> None:
-        self.told.append("reset")
-
-
-def test_each_part_is_confirmed_and_reset_by_itself() -> None:
-    one, other = Counting(), Counting()
-    session = SeveralPartsSession(SimpleNamespace(sessions={"one": one, "other": other}))  # type: ignore[arg-type]
-    session.confirm(1)
-    assert (one.told, other.told) == ([], ["confirm"])
-    session.confirm(None)  # it is not known which one is meant
-    session.reset(0)
-    assert (one.told, other.told) == (["reset"], ["confirm"])
-    session.reset(None)
-    session.expect([SerialNumbers("1"), None])
-    assert one.told == ["reset", "reset", SerialNumbers("1")] and other.told == ["confirm", "reset", None]
 
 
 @pytest.fixture(scope="module")

@@ -54,7 +54,7 @@ class Subject(list[Any]):
 
     def session(self, camera: Any) -> Session:
         self.sessions += 1
-        return Session(self)
+        return Session(self, camera)
 
     def overlay(self, camera: Any, style: Any) -> Any:
         return self
@@ -69,10 +69,10 @@ class Subject(list[Any]):
 class Session:
     """A session that never comes back from frame 1."""
 
-    camera = estimate = None
+    estimate = None
 
-    def __init__(self, subject: Subject) -> None:
-        self.subject = subject
+    def __init__(self, subject: Subject, camera: Any) -> None:
+        self.subject, self.camera = subject, camera
 
     def expect(self, serials: Any) -> None:
         pass

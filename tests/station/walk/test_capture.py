@@ -85,10 +85,10 @@ class Known:
     def __init__(self, poses: list[Array], lost: range = range(0)) -> None:
         self._poses, self._lost = poses, lost
 
-    def process(self, image: object, index: int, time_s: float) -> Pose:
+    def process(self, image: object, index: int, time_s: float) -> tuple[Pose, ...]:
         if index in self._lost:
-            return Pose(None, None, 0.0, TrackingState.LOST, time_s, index)
-        return Pose(self._poses[index], None, 0.9, TrackingState.TRACKED, time_s, index)
+            return (Pose(None, None, 0.0, TrackingState.LOST, time_s, index),)
+        return (Pose(self._poses[index], None, 0.9, TrackingState.TRACKED, time_s, index),)
 
 
 @pytest.mark.slow

@@ -15,7 +15,7 @@ from arview.geometry import Array, apply
 from arview.guideviews import GuideViewSet
 from arview.guideviews.cache import cached_guide_views
 from arview.pose import TrackingState
-from arview.tracking import TrackingSession
+from arview.tracking import SpecimenTracking
 from arview.video import Image
 from arview_lab.evaluation import PoseError, PoseMeter, Scene, SceneFrame, load_scene
 from arview_lab.evaluation.protocols import (
@@ -249,7 +249,7 @@ class DetectionSuite:
         shown = tuple(f for f in scene.frames if infos[str(f.index)][0]["different_fract"] >= MIN_DIFFERENT)
         if not shown:
             return None
-        session = TrackingSession(
+        session = SpecimenTracking(
             full_sphere_views(scene.part.model, WALK_ROUND.distance_mm), scene.camera, scene.part.model
         )
         return LookAlikeWalk(look_alike, scene, shown, session)
@@ -262,7 +262,7 @@ class LookAlikeWalk:
     look_alike: LookAlike
     scene: Scene
     shown: tuple[SceneFrame, ...]
-    session: TrackingSession
+    session: SpecimenTracking
 
     def single_frames(self, count: int) -> Iterator[LookAlikeResult]:
         """Results for some single frames that show the fault."""

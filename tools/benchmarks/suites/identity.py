@@ -21,7 +21,7 @@ from arview.geometry import Array, apply
 from arview.guideviews import GuideViewSet
 from arview.guideviews.cache import cached_guide_views
 from arview.pose import Pose, TrackingState
-from arview.tracking import TrackingSession
+from arview.tracking import SpecimenTracking
 from arview.video import Image
 from arview.video.sources import open_source
 from arview_lab.evaluation import Scene
@@ -181,7 +181,7 @@ class IdentitySuite:
         camera = camera_of(folder / "camera.json")
         distances = [float(np.linalg.norm(pose[:3, 3])) for frame in truth for pose in frame]
         views = full_sphere_views(scene.part.model, (min(distances), max(distances)))
-        session = TrackingSession(views, camera, scene.part.model, initial_cam_from_model=truth[0][0])
+        session = SpecimenTracking(views, camera, scene.part.model, initial_cam_from_model=truth[0][0])
         found = follow_two("two castles", session, images, truth, [True] * len(truth))
         self._details["identity-two_parts"] = asdict(found)
         return [found.row]
@@ -195,7 +195,7 @@ class IdentitySuite:
                 film = BenchFilm(model, photos, BenchOptions(kind, hidden))
                 distances = [float(np.linalg.norm(apply(pose[0], model.center_in_model))) for pose in film.truth]
                 views = full_sphere_views(model, (0.8 * min(distances), 1.25 * max(distances)))
-                session = TrackingSession(views, CAMERA, model, initial_cam_from_model=film.truth[0][0])
+                session = SpecimenTracking(views, CAMERA, model, initial_cam_from_model=film.truth[0][0])
                 title = f"{name}, {kind} for {hidden} frames"
                 results.append(follow_two(title, session, film.images(), film.truth, film.is_there))
         self._details["identity-bench"] = [asdict(one) for one in results]
@@ -216,12 +216,12 @@ class IdentitySuite:
         self._details["identity-one"] = [asdict(one) for one in results]
         return [one.row for one in results]
 
-    def _alone(self) -> Iterator[tuple[str, TrackingSession, Frames, float]]:
+    def _alone(self) -> Iterator[tuple[str, SpecimenTracking, Frames, float]]:
         """Name, session, frames and rate of the films in which one specimen is in view."""
         for name, scene in self._recorded.items():
             distances = [float(np.linalg.norm(pose[:3, 3])) for pose in scene.poses]
             views = full_sphere_views(scene.part.model, (min(distances), max(distances)))
-            session = TrackingSession(views, scene.camera, scene.part.model)
+            session = SpecimenTracking(views, scene.camera, scene.part.model)
             yield name, session, Frames(scene, self._frames), FILM_HZ
         for name in CLIPS:
             clip = ROOT / "samples" / name / "clip.mp4"
@@ -230,7 +230,7 @@ class IdentitySuite:
                 first = next(iter(frames))
                 camera = load_camera(str(clip.parent / "camera.json"), first.shape[1], first.shape[0])
                 views = cached_guide_views(part.model, part.effective_view_range)
-                yield f"sample {name}", TrackingSession(views, camera, part.model), frames, FILM_HZ
+                yield f"sample {name}", SpecimenTracking(views, camera, part.model), frames, FILM_HZ
 
 
 class Frames:
@@ -262,7 +262,7 @@ def bench_models() -> Iterator[tuple[str, Model]]:
 
 def follow_two(
     name: str,
-    session: TrackingSession,
+    session: SpecimenTracking,
     images: Iterable[Image],
     truth: list[tuple[Array, ...]],
     is_there: list[bool],

@@ -20,7 +20,7 @@ from arview.inspection import Verdict, load_inspection
 from arview.overlay import OverlayRenderer
 from arview.pose import Pose, Presence
 from arview.rendering.renderers import ZBufferRenderer
-from arview.tracking import TrackingSession
+from arview.tracking import SpecimenTracking
 from arview.video.sources import open_source
 from arview_lab.evaluation import Scene, load_scene
 from arview_lab.semisynthetic import (
@@ -136,7 +136,7 @@ class PresenceSuite:
             return []
         part, camera = load_part(CASE / "part.toml"), load_camera(CASE / "three.camera.json")
         inspection = load_inspection(CASE / "inspection.json", part.model)
-        session = TrackingSession(declared_views(part), camera, part.model)
+        session = SpecimenTracking(declared_views(part), camera, part.model)
         renderer = OverlayRenderer(part.model, camera, inspection, serial=part.serial)
         result = PresenceResult("case", there=["bolt_1", "hose_clamp"])
         names = [component.name for component in part.model.components]
@@ -147,8 +147,7 @@ class PresenceSuite:
             pose = session.process(frame.image, number, number / 30.0)
             result.add(pose)
             renderer.draw(frame.image, pose, now=inspection.created)
-            wanted = renderer.wanted_labels(pose)
-            texts = [] if wanted is None else [one.text for one in wanted.components]
+            texts = [placed.text for placed in renderer.laid_out.labels]
             labels += len(texts)
             false_pass += [
                 (number, text.name)
@@ -172,7 +171,7 @@ class PresenceSuite:
                     made = make_sequence(look_alike_job(name, model, look_alike, options, photos), self._folder)
                     scene = load_scene(made / "test" / "000001")
                     views = full_sphere_views(scene.part.model, WALK_ROUND.distance_mm)
-                    session = TrackingSession(views, scene.camera, scene.part.model)
+                    session = SpecimenTracking(views, scene.camera, scene.part.model)
                     results.append(self._walk(f"{name}_{look_alike.name}_{variant}", scene, session, look_alike))
         self._details["presence"] = [asdict(result) for result in results]
         return absent_rows(f"{len(results)} sequences of {self._frames} frames", results) if results else []
@@ -186,7 +185,7 @@ class PresenceSuite:
                 distances = [float(np.linalg.norm(pose[:3, 3])) for pose in scene.poses]
                 views = full_sphere_views(scene.part.model, (min(distances), max(distances)))
                 start = None if name == "plate" else scene.frames[0].cam_from_model
-                session = TrackingSession(views, scene.camera, scene.part.model, initial_cam_from_model=start)
+                session = SpecimenTracking(views, scene.camera, scene.part.model, initial_cam_from_model=start)
                 for number, shown in enumerate(scene.frames[: self._limit]):
                     result.add(session.process(scene.image(shown), number, number / 30.0))
                 rows.append(self._right_row(result))
@@ -197,7 +196,7 @@ class PresenceSuite:
                 first = next(iter(open_source(clip))).image
                 camera = camera.scaled(first.shape[1], first.shape[0])
                 result = PresenceResult(f"sample {name}", there=[one.name for one in part.model.components])
-                session = TrackingSession(declared_views(part), camera, part.model)
+                session = SpecimenTracking(declared_views(part), camera, part.model)
                 for number, frame in enumerate(open_source(clip)):
                     if self._limit is not None and number >= self._limit:
                         break
@@ -218,7 +217,7 @@ class PresenceSuite:
         for seed in SOLIDS:
             yield f"random_{seed}", random_solid(seed)
 
-    def _walk(self, name: str, scene: Scene, session: TrackingSession, look_alike: LookAlike) -> PresenceResult:
+    def _walk(self, name: str, scene: Scene, session: SpecimenTracking, look_alike: LookAlike) -> PresenceResult:
         """Follow a sequence with a session."""
         result = PresenceResult(name)
         model = scene.part.model

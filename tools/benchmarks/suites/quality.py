@@ -13,7 +13,7 @@ from arview.geometry import Array, apply, exp_so3, rigid
 from arview.guideviews import GuideViewSet
 from arview.pose import Pose, TrackingState
 from arview.refinement.modalities.edge import smoothed
-from arview.tracking import Tracker, TrackingSession
+from arview.tracking import SpecimenTracking, Tracker
 from arview.tracking.tracker_options import STAGES
 from arview.video import Image
 from arview_lab.evaluation import PoseMeter, Scene, SceneFrame, scene_guide_views
@@ -127,13 +127,13 @@ class _PoseSampler:
         """Poses with their quality, and the longest run of frames `tracked` far off."""
         samples: list[PoseSample] = []
         run = longest = 0
-        session: TrackingSession | None = None
+        session: SpecimenTracking | None = None
         for number, frame in enumerate(self._scene.frames):
             truth, image = frame.cam_from_model, self._scene.image(frame)
             if session is None or self._name in PHOTO_SEQUENCES:
                 if truth is None:
                     continue
-                session = TrackingSession(
+                session = SpecimenTracking(
                     self._views, self._scene.camera, self._scene.part.model, initial_cam_from_model=truth
                 )
             pose = session.process(image, frame.index, number / 30.0)

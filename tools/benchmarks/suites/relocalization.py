@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from arview.pose import TrackingState
-from arview.tracking import SessionOptions, TrackingSession
+from arview.tracking import SessionOptions, SpecimenTracking
 from arview_lab.evaluation import PoseMeter, Scene
 from arview_lab.evaluation.protocols import box_symmetries
 from arview_lab.evaluation.run import COARSE, IN_VIEW
@@ -77,8 +77,8 @@ def lose_and_find(name: str, scene: Scene, use_appearance_memory: bool, losses: 
     frames = [f for f in scene.frames if f.cam_from_model is not None]
     half = len(frames) // 2
     step = max(1, round((len(frames) - half) / losses))
-    session = TrackingSession(views, scene.camera, model, options, initial_cam_from_model=frames[0].cam_from_model)
-    session.detector.detect(scene.image(frames[0]), max_results=1)  # compiled code is loaded
+    session = SpecimenTracking(views, scene.camera, model, options, initial_cam_from_model=frames[0].cam_from_model)
+    session.search.detector.detect(scene.image(frames[0]), max_results=1)  # compiled code is loaded
     covered = np.full((scene.camera.height, scene.camera.width, 3), 90, dtype=np.uint8)
     count, right, wrong, cpu_ms = 0, 0, 0, []
     for number, frame in enumerate(frames):
@@ -100,8 +100,8 @@ def lose_and_find(name: str, scene: Scene, use_appearance_memory: bool, losses: 
         right += is_right
         wrong += pose.cam_from_model is not None and not is_right
         if not is_right:
-            kept = session.appearance_memory
-            session = TrackingSession(views, scene.camera, model, options, initial_cam_from_model=frame.cam_from_model)
-            session.appearance_memory = kept
+            kept = session.search.memory
+            session = SpecimenTracking(views, scene.camera, model, options, initial_cam_from_model=frame.cam_from_model)
+            session.search.memory = kept
             session.process(image, frame.index, number / 30.0)
-    return Relocalized(count, right, wrong, tuple(cpu_ms), len(session.appearance_memory))
+    return Relocalized(count, right, wrong, tuple(cpu_ms), len(session.search.memory))

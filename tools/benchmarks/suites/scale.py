@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from arview.pose import TrackingState
-from arview.tracking import TrackingSession
+from arview.tracking import SpecimenTracking
 from arview.video import Image
 from arview_lab.evaluation import Scene, SceneResult, evaluate_scene, scene_guide_views
 from arview_lab.evaluation.bop import SceneFrame
@@ -69,7 +69,7 @@ def acceptance_rows(scene: Scene) -> list[ResultRow]:
         for frame in shown.frames:
             if frame.cam_from_model is None:
                 continue
-            session = TrackingSession(
+            session = SpecimenTracking(
                 views, shown.camera, scene.part.model, initial_cam_from_model=frame.cam_from_model
             )
             pose = session.process(shown.image(frame), frame.index, 0.0)

@@ -20,10 +20,8 @@ from arview.geometry import Array, apply
 from arview.guideviews import GuideViewSet
 from arview.guideviews.cache import cached_guide_views
 from arview.overlay import OverlayRenderer
-from arview.overlay.several import SeveralOverlay
 from arview.pose import Pose
-from arview.tracking import TrackingSession
-from arview.tracking.several.sessions import SeveralSessions
+from arview.tracking import TrackedPart, TrackingSession
 from arview.video import Image, VideoSink, open_source
 from arview_lab.evaluation import Scene, scene_guide_views
 from recordings import ROOT
@@ -178,36 +176,38 @@ def run(
     frames: list[tuple[Image, tuple[Array, Array]]], camera: Camera, halves: dict[str, Half]
 ) -> tuple[list[tuple[Pose, ...]], Array]:
     """Poses of some parts in all frames, and the time of a frame (2,), ms, by wall and CPU: read, tracked, drawn."""
-    first: dict[str, TrackingSession] = {}
-    sessions, renderers = {}, {}
+    views: dict[str, GuideViewSet] = {}
+    parts = []
+    overlay: OverlayRenderer | None = None
     for name, half in halves.items():
-        like = first.get(half.part.model.source_hash)
-        views = half.views if like is None else like.views
-        sessions[name] = TrackingSession(views, camera, half.part.model, like=like)
-        first.setdefault(half.part.model.source_hash, sessions[name])
-        renderers[name] = OverlayRenderer(half.part.model, camera)
+        shared = views.setdefault(half.part.model.source_hash, half.views)
+        parts.append(TrackedPart(shared, half.part.model, name))
+        if overlay is None:
+            overlay = OverlayRenderer(half.part.model, camera, name=name)
+        else:
+            overlay.add(half.part.model, name=name)
     with TemporaryDirectory() as folder:
         made = Path(folder) / "frames.mp4"
         write(made, camera, [image for image, _ in frames])
-        recorder = Recorder(SeveralSessions(sessions))
+        recorder = Recorder(TrackingSession(parts, camera))
         began = time.process_time()
         with open_source(made) as source:
             sink = VideoSink(Path(folder) / "out.mp4", camera.width, camera.height, 30.0, source)
-            summary = annotate(source, recorder, SeveralOverlay(renderers), sink)
+            summary = annotate(source, recorder, overlay, sink)
         cpu_s = time.process_time() - began
     return recorder.found, 1e3 * np.array([summary.seconds, cpu_s]) / summary.frames
 
 
 class Recorder:
-    """Sessions whose poses are kept."""
+    """A session whose poses are kept."""
 
-    def __init__(self, sessions: SeveralSessions) -> None:
-        self._sessions = sessions
+    def __init__(self, session: TrackingSession) -> None:
+        self._session = session
         self.found: list[tuple[Pose, ...]] = []
 
     def process(self, image: Image, index: int, time_s: float) -> tuple[Pose, ...]:
         """Poses of the next frame."""
-        self.found.append(self._sessions.process(image, index, time_s))
+        self.found.append(self._session.process(image, index, time_s))
         return self.found[-1]
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from arview.cad import Model, Symmetry
 from arview.detection import Detector
 from arview.pose import TrackingState
-from arview.tracking import TrackingSession
+from arview.tracking import SpecimenTracking
 from arview_lab.evaluation import FrameResult, PoseMeter, Scene, SceneResult, scene_guide_views, summarise
 from arview_lab.evaluation.run import COARSE
 from rows import ResultRow, timing, watched
@@ -28,7 +28,7 @@ def evaluate_photos(scene: Scene) -> SceneResult:
         truth = frame.cam_from_model
         if truth is None:
             continue
-        session = TrackingSession(views, scene.camera, scene.part.model, initial_cam_from_model=truth)
+        session = SpecimenTracking(views, scene.camera, scene.part.model, initial_cam_from_model=truth)
         pose = session.process(scene.image(frame), frame.index, 0.0)
         error = None if pose.cam_from_model is None else meter.measure(pose.cam_from_model, truth)
         results.append(FrameResult(pose, error, True, frame.is_truth, frame.visible, False, not results))

@@ -287,10 +287,10 @@ class Script:
     def __init__(self, poses: list[Array | None]) -> None:
         self.poses = iter(poses)
 
-    def process(self, image: object, index: int, time_s: float) -> Pose:
+    def process(self, image: object, index: int, time_s: float) -> tuple[Pose, ...]:
         pose = next(self.poses)
         state = TrackingState.LOST if pose is None else TrackingState.TRACKED
-        return Pose(pose, None, 0.9, state, time_s, index, ms=2.0 + index)
+        return (Pose(pose, None, 0.9, state, time_s, index, ms=2.0 + index),)
 
 
 def test_evaluation_counts_lost_wrong_and_good_frames(tmp_path: Path, views: GuideViewSet) -> None:

@@ -76,8 +76,8 @@ class Trials:
         return {"frames": 1, "tracked": int(best is not None), "quality": pose.quality, "reason": reason}
 
     def _track(self, part: Part, views: guideviews.GuideViewSet, camera: Camera, images: list[Image]) -> dict[str, Any]:
-        session = tracking.TrackingSession(views, camera, part.model)
-        poses = [session.process(image, index, index / 30.0) for index, image in enumerate(images)]
+        session = tracking.TrackingSession.of(views, camera, part.model)
+        poses = [session.process(image, index, index / 30.0)[0] for index, image in enumerate(images)]
         tracked = [pose for pose in poses if pose.state is TrackingState.TRACKED]
         shown = max(poses, key=lambda pose: pose.quality)
         self._draw(part, camera, images[shown.index], shown)

@@ -34,9 +34,9 @@ _TAKEN, _FOCAL_LENGTH_35MM = 0x9003, 0xA405
 
 
 class Tracks(Protocol):
-    """What gives the pose of a part in each frame."""
+    """What tracks one part: `arview.tracking.TrackingSession`."""
 
-    def process(self, image: Any, index: int, time_s: float) -> Pose:
+    def process(self, image: Any, index: int, time_s: float) -> tuple[Pose, ...]:
         """The pose in a frame."""
         ...
 
@@ -134,7 +134,7 @@ def capture_photos(
     try:
         for frame in source:
             frames += 1
-            pose = session.process(frame.image, frame.index, frame.time_s)
+            (pose,) = session.process(frame.image, frame.index, frame.time_s)
             camera = camera_of(frame.index)
             advice = guide.of(camera).update(pose, frame.image, frame.time_s)
             if advice.takes and pose.cam_from_model is not None:

@@ -34,38 +34,19 @@ PIXEL_MARGIN = 0.03
 """Distance from the outline, in diameters, at which a named pixel still lies on a part."""
 
 
-class PictureFinder(Protocol):
-    """What finds the part in a whole picture: `arview.detection.detector.Detector`."""
+class FindsNear(Protocol):
+    """Finds the part near a pose."""
 
-    def detect(
-        self, image: NDArray[np.uint8], max_results: int = 3, is_thorough: bool = True, guesses: Sequence[Array] = ()
-    ) -> list[Detection]:
-        """Poses of the part in an image, best first."""
-        ...
-
-
-class NearFinder(Protocol):
-    """What finds the part near a pose: `arview.tracking.guided_init.GuidedInit`."""
-
-    def find(self, image: NDArray[np.uint8], cam_from_model: Array) -> GuidedPose | None:
+    def __call__(self, image: NDArray[np.uint8], cam_from_model: Array, /) -> GuidedPose | None:
         """The best pose near a given one, whatever its quality; None outside the picture."""
         ...
 
 
-class Finders(Protocol):
-    """The searches that are needed, made when they are first used: `arview.tracking.TrackingSession`."""
+class FindsAnywhere(Protocol):
+    """Finds the part in a whole picture."""
 
-    others: tuple[Array, ...]
-    """Poses (4,4) of other specimens that are tracked by sessions of their own."""
-
-    @property
-    def detector(self) -> PictureFinder:
-        """Search of a whole picture."""
-        ...
-
-    @property
-    def guided_init(self) -> NearFinder:
-        """Search around a pose."""
+    def __call__(self, image: NDArray[np.uint8], max_results: int, is_thorough: bool, /) -> Sequence[Detection]:
+        """Poses of the part in an image, best first."""
         ...
 
 
@@ -74,40 +55,38 @@ class SpecimenSearch:
 
     Args:
         outline: of the part.
+        find_near: the search around a pose.
+        find_anywhere: the search of a whole picture.
     """
 
-    def __init__(self, outline: PartOutline) -> None:
+    def __init__(self, outline: PartOutline, find_near: FindsNear, find_anywhere: FindsAnywhere) -> None:
         self._outline = outline
+        self._find_near, self._find_anywhere = find_near, find_anywhere
 
-    def others(
-        self, image: NDArray[np.uint8], known: Array, finders: Finders, is_thorough: bool = False
-    ) -> list[Array]:
+    def others(self, image: NDArray[np.uint8], known: Array, is_thorough: bool = False) -> list[Array]:
         """Poses (4,4) of the part in an image (H,W,3) uint8 RGB, apart from a known one (4,4)."""
         place = self._outline.place(known)
         picture = hide_specimens(image, [known], self._outline.views, self._outline.camera)
-        found = finders.detector.detect(picture, MAX_SPECIMENS, is_thorough)
+        found = self._find_anywhere(picture, MAX_SPECIMENS, is_thorough)
         return [one.cam_from_model for one in found if self.is_apart(self._outline.place(one.cam_from_model), place)]
 
-    def at_place(
-        self, image: NDArray[np.uint8], guess: Array, finders: Finders, is_turned: bool = False
-    ) -> Array | None:
+    def at_place(self, image: NDArray[np.uint8], guess: Array, is_turned: bool = False) -> Array | None:
         """The pose (4,4) of a part at the place of a rough pose (4,4); None without one there.
 
         Args:
             image: (H,W,3) uint8 RGB.
             guess: rough pose.
-            finders: the searches.
             is_turned: whether the part may be turned far, as after a camera has gone round it.
         """
         wanted = self._outline.place(guess)
         for start in self._turned(guess) if is_turned else [guess]:
-            found = finders.guided_init.find(image, start)
+            found = self._find_near(image, start)
             is_there = found is not None and found.quality >= FOUND_QUALITY
             if found and is_there and self._is_near(self._outline.place(found.cam_from_model), wanted):
                 return found.cam_from_model
         return None
 
-    def at_pixel(self, image: NDArray[np.uint8], known: Array, pixel: Array, finders: Finders) -> Array | None:
+    def at_pixel(self, image: NDArray[np.uint8], known: Array, pixel: Array) -> Array | None:
         """The pose (4,4) of the part at a pixel (2,) that lies on it, beside a known one (4,4); None without one there.
 
         Parts on one bench are seen from about the same side, so those of the known pose are tried before all others.
@@ -120,11 +99,11 @@ class SpecimenSearch:
             turned = self._turned_by(start, exp_so3([0.0, np.deg2rad(turn_deg), 0.0]))
             guesses += [self._farther(turned, factor) for factor in PIXEL_DISTANCES]
         for guess in guesses:
-            found = finders.guided_init.find(image, guess)
+            found = self._find_near(image, guess)
             is_good = found is not None and found.quality >= FOUND_QUALITY
             if found and is_good and self._outline.contains(found.cam_from_model, pixel, PIXEL_MARGIN):
                 return found.cam_from_model
-        for other in self.others(image, known, finders, is_thorough=True):
+        for other in self.others(image, known, is_thorough=True):
             if self._outline.contains(other, pixel, PIXEL_MARGIN):
                 return other
         return None

@@ -17,7 +17,7 @@ from arview.geometry import Array
 from arview.guideviews import GuideViewOptions, GuideViewSet
 from arview.guideviews.cache import cached_guide_views
 from arview.pose import Pose, TrackingState
-from arview.tracking import SessionOptions, TrackingSession
+from arview.tracking import SessionOptions, TrackedPart, TrackingSession
 from arview.tracking.guide_pose import GUIDE_PREFIX, guide_pose
 from arview_lab.evaluation.bop import Scene, SceneFrame
 from arview_lab.evaluation.metrics import PoseError, PoseMeter
@@ -161,7 +161,7 @@ def evaluate_scene(
     options: SessionOptions | None = None,
     views: GuideViewSet | None = None,
     progress: StepProgress | None = None,
-    make_session: Callable[[GuideViewSet, Camera, Array | None], Session[Pose]] | None = None,
+    make_session: Callable[[GuideViewSet, Camera, Array | None], Session] | None = None,
 ) -> SceneResult:
     """Track the part through the scene.
 
@@ -193,14 +193,8 @@ def evaluate_scene(
     if init.startswith(GUIDE_PREFIX):
         guide = guide_pose(init.removeprefix(GUIDE_PREFIX), scene.part, views.view_range, scene.camera)
     if make_session is None:
-        session: Session[Pose] = TrackingSession(
-            views,
-            scene.camera,
-            model,
-            options or SessionOptions(),
-            initial_cam_from_model=first_pose,
-            guide_cam_from_model=guide,
-        )
+        part = TrackedPart(views, model, initial_cam_from_model=first_pose, guide_cam_from_model=guide)
+        session: Session = TrackingSession([part], scene.camera, options)
     else:
         session = make_session(views, scene.camera, first_pose)
     meter = PoseMeter(model, scene.camera, views, scene.part.symmetries, scene.symmetric_poses)
@@ -219,10 +213,10 @@ def evaluate_scene(
 
 
 def _track(
-    scene: Scene, frames: tuple[SceneFrame, ...], session: Session[Pose], meter: PoseMeter, has_pose: bool
+    scene: Scene, frames: tuple[SceneFrame, ...], session: Session, meter: PoseMeter, has_pose: bool
 ) -> Iterator[FrameResult]:
     for number, frame in enumerate(frames):
-        pose = session.process(scene.image(frame), frame.index, number / 30.0)
+        (pose,) = session.process(scene.image(frame), frame.index, number / 30.0)
         truth = frame.cam_from_model
         is_known = pose.cam_from_model is not None and truth is not None
         yield FrameResult(

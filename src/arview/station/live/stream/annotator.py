@@ -10,11 +10,12 @@ from functools import cached_property
 import cv2
 import numpy as np
 
+from arview import overlay
 from arview.camera import Camera
 from arview.station.live.stream.feed import TrackedFrame
 from arview.station.live.stream.frames import to_jpeg
 from arview.station.live.stream.subject import OverlayStyle
-from arview.station.live.stream.subjects import FrameOverlay, Subjects
+from arview.station.live.stream.subjects import Subjects
 from arview.video import Image
 
 DRAW_TIMEOUT_S = 10.0
@@ -73,7 +74,7 @@ class _StyleRenderer:
     def __init__(self, subjects: Subjects, style: OverlayStyle, screen: Screen | None) -> None:
         self._subjects, self._style, self._screen = subjects, style, screen
         self._camera: Camera | None = None
-        self._overlay: FrameOverlay | None = None
+        self._overlay: overlay.OverlayRenderer | None = None
         self._made_for: tuple[Camera, int] | None = None
         self._last: AnnotatedFrame | None = None
 

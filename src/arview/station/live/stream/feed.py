@@ -20,7 +20,6 @@ from arview.station.live.options import UNDISTORT
 from arview.station.live.stream.frames import DecodedFrame, IncomingFrame, to_jpeg
 from arview.station.live.stream.newest import NewestSlot
 from arview.station.live.stream.notices import Notice, without_folder
-from arview.station.live.stream.sessions import FeedSession
 from arview.station.live.stream.subjects import Subjects
 
 STUCK_S = 90.0
@@ -115,7 +114,7 @@ class Feed:
         self._listeners: list[Callable[[TrackedFrame], None]] = []
         self._kept: deque[TrackedFrame] = deque(maxlen=KEPT_FRAMES)
         self._arrived_s: float | None = None
-        self._session: FeedSession | None = None
+        self._session: tracking.TrackingSession | None = None
         self._view: FrameView | None = None
         self._wanted: deque[tuple[str, int | None]] = deque()
         self._camera: Camera
@@ -306,7 +305,7 @@ class Feed:
             poses = tuple(replace(pose, instance=one.name) for one in self._subjects)
         else:
             poses = self._session.process(np.ascontiguousarray(frame.image), frame.frame_id, arrived_s)
-            self._camera = self._session.camera or self._camera
+            self._camera = self._session.camera
         return TrackedFrame(
             frame=frame,
             poses=poses,
@@ -320,7 +319,7 @@ class Feed:
             subjects=self._subjects,
         )
 
-    def _prepare(self, session: FeedSession) -> None:
+    def _prepare(self, session: tracking.TrackingSession) -> None:
         """Tell a session of which serial numbers the labels are, and what the user has asked for since."""
         session.expect(self._subjects.serial_numbers)
         while self._wanted:

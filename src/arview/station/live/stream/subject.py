@@ -12,7 +12,6 @@ from arview import overlay as overlays
 from arview.cad import Part
 from arview.camera import Camera, guess_camera
 from arview.fiducials import SerialNumbers
-from arview.geometry import Array
 from arview.inspection import Inspection
 from arview.station.live.options import LiveOptions
 from arview.station.live.stream.inspection_file import InspectionFile
@@ -129,32 +128,25 @@ class Subject:
             return [Notice("inspection_none", "info", "no inspection: nothing has been measured")]
         return self._file.notices()
 
-    def session(self, camera: Camera) -> tracking.TrackingSession | tracking.SelfCalibratingSession:
-        """A new tracking session for a feed with this camera, which is replaced while it runs if it is guessed."""
+    def tracked_part(self, camera: Camera) -> tracking.TrackedPart:
+        """The part for a tracking session; the only part of a feed with this camera may wait at its guide view."""
         guide = None
-        if self.options.guide is not None:
+        if self.options.guide is not None and not self.name:
             guide = guide_pose(self.options.guide, self.part, self.views.view_range, camera)
+        return tracking.TrackedPart(
+            self.views, self.part.model, self.name, self.serial_numbers, guide_cam_from_model=guide
+        )
 
-        def make_session(camera: Camera, start: Array | None) -> tracking.TrackingSession:
-            return tracking.TrackingSession(
-                self.views,
-                camera,
-                self.part.model,
-                initial_cam_from_model=start,
-                guide_cam_from_model=guide,
-                serials=self.serial_numbers,
-            )
+    def overlay(
+        self, camera: Camera, style: OverlayStyle, number: int = 0, beside: overlays.OverlayRenderer | None = None
+    ) -> overlays.OverlayRenderer:
+        """A renderer of the overlay for a feed with this camera; ``number`` is that of this part.
 
-        if self.options.camera is not None:
-            return make_session(camera, None)
-        return tracking.SelfCalibratingSession(make_session, self.views, camera)
-
-    def session_beside(self, camera: Camera, like: tracking.TrackingSession | None) -> tracking.TrackingSession:
-        """A session among others of the same stream, which shares the detector of one of the same part if given."""
-        return tracking.TrackingSession(self.views, camera, self.part.model, like=like, serials=self.serial_numbers)
-
-    def overlay(self, camera: Camera, style: OverlayStyle, number: int = 0) -> overlays.OverlayRenderer:
-        """A renderer of the overlay for a feed with this camera; ``number`` is that of this part."""
+        Args:
+            camera, style: of the drawing.
+            number: of this part.
+            beside: renderer of the parts before, to which this one is added; None: a new one.
+        """
         with self._lock:
             pending = self.pending
         inspection = self.inspection
@@ -166,7 +158,11 @@ class Subject:
             if inspection is not None:
                 wanted = tuple(one for one in inspection.components if is_of_it and one.name == style.only)
                 inspection = replace(inspection, components=wanted)
-        options = replace(style.overlay_options(), max_age_days=self.label_options.max_age_days)
-        return overlays.OverlayRenderer(
-            self.part.model, camera, inspection, options, serial=self.serial, pending=pending
-        )
+        model, name, serial = self.part.model, self.name, self.serial
+        if beside is None:
+            options = replace(style.overlay_options(), max_age_days=self.label_options.max_age_days)
+            return overlays.OverlayRenderer(
+                model, camera, inspection, options, name=name, serial=serial, pending=pending
+            )
+        beside.add(model, inspection, name=name, serial=serial, pending=pending)
+        return beside

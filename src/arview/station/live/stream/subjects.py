@@ -4,41 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import Protocol
 
 from arview import overlay as overlays
 from arview import tracking
 from arview.camera import Camera, guess_camera, load_camera
 from arview.fiducials import SerialNumbers
-from arview.pose import Pose
 from arview.station.live.options import LiveOptions
 from arview.station.live.stream.notices import Notice
-from arview.station.live.stream.sessions import FeedSession, OnePartSession, SeveralPartsSession
 from arview.station.live.stream.subject import OverlayStyle, Subject
-from arview.video import Image, load_square_camera
+from arview.video import load_square_camera
 
 PHONE_FOV = "fov:66"
 """Camera assumed for phones: field of view along the longer side. Their main cameras have 65 to 72° (24 to 28 mm)."""
 MAX_FILE_NAME = 80
 """Letters of the names of the parts in the name of a recording."""
-
-
-class FrameOverlay(Protocol):
-    """Draws all parts on a frame."""
-
-    def draw(self, image: Image, poses: tuple[Pose, ...], /) -> Image:
-        """The annotated frame."""
-        ...
-
-
-class _OnePartOverlay:
-    """Draws the only part."""
-
-    def __init__(self, renderer: overlays.OverlayRenderer) -> None:
-        self._renderer = renderer
-
-    def draw(self, image: Image, poses: tuple[Pose, ...]) -> Image:
-        return self._renderer.draw(image, poses[0])
 
 
 class Subjects:
@@ -112,22 +91,14 @@ class Subjects:
             return load_camera(PHONE_FOV, width, height)
         return guess_camera(width, height)
 
-    def session(self, camera: Camera) -> FeedSession:
-        """The tracking of all parts for a feed with this camera."""
-        if len(self._parts) == 1:
-            return OnePartSession(self._parts[0].session(camera))
-        first: dict[str, tracking.TrackingSession] = {}
-        sessions = {}
-        for one in self._parts:
-            model = one.part.model.source_hash
-            session = one.session_beside(camera, first.get(model))
-            sessions[one.name] = session
-            first.setdefault(model, session)
-        return SeveralPartsSession(tracking.SeveralSessions(sessions))
+    def session(self, camera: Camera) -> tracking.TrackingSession:
+        """The tracking of all parts for a feed with this camera, which is replaced while it runs if it is guessed."""
+        parts = [one.tracked_part(camera) for one in self._parts]
+        return tracking.TrackingSession(parts, camera, is_guessed=self.options.camera is None)
 
-    def overlay(self, camera: Camera, style: OverlayStyle) -> FrameOverlay:
+    def overlay(self, camera: Camera, style: OverlayStyle) -> overlays.OverlayRenderer:
         """The drawing of all parts for a feed with this camera."""
-        renderers = {one.name: one.overlay(camera, style, number) for number, one in enumerate(self._parts)}
-        if len(self._parts) == 1:
-            return _OnePartOverlay(next(iter(renderers.values())))
-        return overlays.SeveralOverlay(renderers)
+        overlay = self._parts[0].overlay(camera, style)
+        for number, part in enumerate(self._parts[1:], 1):
+            part.overlay(camera, style, number, overlay)
+        return overlay

@@ -1,3 +1,0 @@
-"""Options of the monitoring of the identity."""
-
-from __future__ import annotations

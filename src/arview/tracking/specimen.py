@@ -1,0 +1,377 @@
+"""SpecimenTracking: detects one specimen of a part and tracks it through a stream of frames.
+
+The part is ``searching`` until first found, ``tracked`` while the picture supports its pose, ``critical`` while the
+support is weak, and ``lost`` when there is none. Every frame follows the last pose or examines what the search
+proposes; a pose is then disambiguated, its components are checked, and the part's appearance is remembered. The
+transitions between the states are a table, see `session_state`.
+"""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+from numpy.typing import NDArray
+
+from arview.assembly import AssemblyMonitor, Turn
+from arview.cad import Model
+from arview.camera import Camera, FrameView
+from arview.core.checks import check_type
+from arview.detection import RejectedHypothesis
+from arview.errors import MismatchError
+from arview.fiducials import SerialNumbers
+from arview.geometry import Array, invert
+from arview.guideviews import GuideViewSet
+from arview.pose import Identity, Pose, TrackingState
+from arview.tracking.diagnosis import diagnose_loss
+from arview.tracking.disambiguation import HypothesisSet
+from arview.tracking.estimate import Estimate
+from arview.tracking.identity import IdentityMonitor
+from arview.tracking.part_search import ALIGN, FoundPose, PartSearch
+from arview.tracking.pose_recheck import LocalSearchRecheck
+from arview.tracking.session_options import CRITICAL_QUALITY, LOST_QUALITY, TRACKED_QUALITY, SessionOptions
+from arview.tracking.session_state import Event, SessionState
+from arview.tracking.several.specimens import CoveredPlace
+from arview.tracking.tracker import Tracker
+from arview.tracking.tracker_options import TrackerOptions
+
+LOST_FRAMES = 2
+"""Frames in a row below ``LOST_QUALITY`` after which the part is lost."""
+CRITICAL_FRAMES = 45
+"""Critical frames in a row after which the part is lost."""
+MIN_IN_PICTURE = 0.25
+"""Share of the outline inside the picture below which no pose is kept."""
+SAME_SPECIMEN = (Identity.FOLLOWED, Identity.CONFIRMED)
+"""With these identities what was known of the components before a loss is taken up."""
+
+
+class SpecimenTracking:
+    """Detects and tracks one specimen of a part through a stream of frames.
+
+    Args:
+        views: guide views of the model.
+        camera: of the frames.
+        model: the CAD model of the guide views; the texture modality needs its surface.
+        options: see `SessionOptions`.
+        initial_cam_from_model: (4,4) mm, rough pose in the first frame, which is refined instead of a search.
+        guide_cam_from_model: (4,4) mm, guide pose. The part is first found when it is brought near this pose, not by
+            a search, and by both after it has been lost for a while.
+        like: tracking of another specimen with the same guide views, camera and options, whose preparation is shared.
+        serials: serial number of the part to which the labels belong, to be read from codes in the frames; None: codes
+            are not read.
+
+    Attributes:
+        views: guide views of the model.
+        frames, camera: how frames become the pictures that are tracked, and the camera of these.
+        search: the searches for the specimen.
+        components: says whether the components are where the CAD has them.
+        identity: says whether the specimen in view is the one that was followed.
+
+    Raises:
+        MismatchError: the guide views belong to another model.
+        InputError: an initial or guide pose that is not a rigid transform.
+    """
+
+    def __init__(
+        self,
+        views: GuideViewSet,
+        camera: Camera,
+        model: Model,
+        options: SessionOptions | None = None,
+        *,
+        initial_cam_from_model: Array | None = None,
+        guide_cam_from_model: Array | None = None,
+        like: SpecimenTracking | None = None,
+        serials: SerialNumbers | None = None,
+    ) -> None:
+        check_type(views, GuideViewSet, "TrackingSession: views")
+        check_type(camera, Camera, "TrackingSession: camera")
+        check_type(model, Model, "TrackingSession: model")
+        self.options = o = options or SessionOptions()
+        if views.model_hash != model.source_hash:
+            raise MismatchError(
+                f"guide views of model {views.model_name!r} ({views.model_hash[:12]}) do not belong to "
+                f"{model.name!r} ({model.source_hash[:12]})"
+            )
+        self.frames: FrameView = FrameView(camera) if like is None else like.frames
+        self.camera = camera = self.frames.tracked_camera
+        self.views = views
+        self.search: PartSearch = PartSearch(
+            views,
+            camera,
+            model,
+            o,
+            initial_cam_from_model=initial_cam_from_model,
+            guide_cam_from_model=guide_cam_from_model,
+            like=None if like is None else like.search,
+        )
+        self._part = self.search.local.refiner.part
+        self.tracker = Tracker(
+            views,
+            camera,
+            model,
+            TrackerOptions(use_region=o.use_region, use_edge=o.use_edge, use_texture=o.use_texture),
+            recheck=LocalSearchRecheck(self.search.local) if o.use_recheck else None,
+            part=self._part,
+        )
+        self.components: AssemblyMonitor = AssemblyMonitor(
+            views, camera, model, like=None if like is None else like.components
+        )
+        self.identity = IdentityMonitor(views, camera, self.search.near, self.search.anywhere, serials)
+        self._state = SessionState()
+
+    def __repr__(self) -> str:
+        return f"<SpecimenTracking {self.views.model_name}: {self.state}, {len(self.views)} views, {self.camera!r}>"
+
+    @property
+    def state(self) -> TrackingState:
+        """State after the last frame."""
+        return self._state.state
+
+    @property
+    def has_pose(self) -> bool:
+        """Whether the part was found and is followed."""
+        return self._state.has_pose
+
+    @property
+    def reason(self) -> str:
+        """Why the last search found nothing, or why the part was lost."""
+        return self._state.reason
+
+    def reset(self) -> None:
+        """Forget the part's pose and search again. The remembered appearance is kept."""
+        self._state = SessionState()
+        self.components.forget()
+        self.identity.reset()
+
+    def confirm(self) -> None:
+        """Say that the specimen tracked now is the one to which the labels belong, see `Identity`."""
+        self.identity.confirm()
+
+    def name_at(self, index: int, pixel: tuple[float, float]) -> None:
+        """As `IdentityMonitor.name_at`, for a pixel of the frames as they come; raises InputError outside them."""
+        self.identity.name_at(index, self.frames.pixel(pixel))
+
+    def give_up(self, reason: str) -> None:
+        """Give the pose up, for a reason in words, and search again."""
+        if self.has_pose:
+            self._give_up(reason)
+
+    def process(
+        self,
+        image: NDArray[np.uint8],
+        index: int,
+        time_s: float,
+        others: tuple[Array, ...] = (),
+        covers: tuple[CoveredPlace, ...] = (),
+    ) -> Pose:
+        """Pose and state of the next frame.
+
+        Args:
+            image: (H,W,3) uint8 RGB of the camera's size.
+            index: index of the frame, copied into the pose.
+            time_s: time stamp of the frame, copied into the pose.
+            others: poses (4,4) of other specimens of the part, which are not taken for this one.
+            covers: where other parts are, at which this one is searched for in every second round of searches only.
+
+        Raises:
+            InputError: an image of another size or type.
+        """
+        started = time.perf_counter()
+        image = self.frames.picture(image, index)
+        self.search.others, self.search.covers = others, covers
+        estimate, reason = self._follow(image) if self._state.has_pose else self._search(image)
+        if estimate is not None:
+            estimate, reason = self._disambiguate(image, estimate, reason)
+            reason = self._check_components(image, estimate, reason)
+            self._remember(image, estimate)
+        known = self.identity.update(image, estimate, index, time_s, others, self._state.is_confirmed)
+        if known.cam_from_model is not None and estimate is not None:
+            estimate = self._restart(image, known.cam_from_model)
+        elif estimate is not None and self._state.is_confirmed and known.identity in SAME_SPECIMEN:
+            self.components.resume(estimate.cam_from_model, self._state.frames_without_pose)
+        ms = (time.perf_counter() - started) * 1e3
+        if estimate is None:
+            return Pose(
+                None,
+                None,
+                0.0,
+                state=self.state,
+                time_s=time_s,
+                index=index,
+                ms=ms,
+                reason=reason,
+                guide_cam_from_model=self.search.guide_pose(self._state),
+            )
+        pose = estimate.cam_from_model
+        return Pose(
+            cam_from_model=pose,
+            covariance=self.tracker.covariance(estimate),
+            quality=estimate.quality,
+            state=self.state,
+            time_s=time_s,
+            index=index,
+            ms=ms,
+            reason=reason,
+            mismatches=self.components.mismatches,
+            unverified=self.components.unverified,
+            alternatives=(*self._state.hypotheses.poses(pose), *self.components.other_poses(pose)),
+            identity=known.identity,
+            identity_reason=known.reason,
+            serial=known.serial,
+            components=self.components.presence(pose, bool(self._state.hypotheses)),
+        )
+
+    # --- Follow a pose ------------------------------------------------------------------------------------
+
+    def _follow(self, image: NDArray[np.uint8]) -> tuple[Estimate | None, str]:
+        """Track the part into this frame; the reason says why the pose is weak or was given up."""
+        s = self._state
+        estimate = self.tracker.track(image)
+        is_possible = self.search.is_possible(estimate.cam_from_model)
+        is_outside = estimate.evidence.points_in_picture < MIN_IN_PICTURE or not is_possible
+        is_poor = is_outside or estimate.quality < LOST_QUALITY
+        s.poor_frames = s.poor_frames + 1 if is_poor else 0
+        if s.poor_frames >= LOST_FRAMES or (is_poor and not s.is_confirmed):
+            recent = (s.recent_poses[0], s.recent_poses[1]) if len(s.recent_poses) == 2 else None
+            return self._give_up(diagnose_loss(image, estimate, recent, self.camera, self.views, is_possible))
+        if not is_poor:
+            s.recent_poses = (*s.recent_poses[-1:], estimate.cam_from_model)
+            is_supported = estimate.quality >= (CRITICAL_QUALITY if s.is_supported else TRACKED_QUALITY)
+            if is_supported and not estimate.is_restless:
+                s.confirm()
+                return estimate, ""
+        s.apply(Event.WEAK)
+        s.critical_frames += 1
+        if s.critical_frames > CRITICAL_FRAMES or not s.is_confirmed:
+            return self._give_up("the outline is not seen where it should be")
+        return estimate, "the pose jumps" if estimate.is_restless else "the outline is hardly seen"
+
+    def _give_up(self, reason: str) -> tuple[None, str]:
+        """Give the pose up; one from the guide view that was never confirmed leaves the session waiting as before."""
+        if self.search.has_guide and not self._state.is_confirmed:
+            self._state.retract()
+        else:
+            recent = self._state.recent_poses
+            self._state.lose(reason)
+            # Poses shortly before a loss may be wrong; the identity rests on the last one without doubt.
+            last = self.identity.last_pose
+            self.components.set_aside(recent[-1] if last is None and recent else last)
+        return None, self._state.reason
+
+    # --- Search -------------------------------------------------------------------------------------------
+
+    def _search(self, image: NDArray[np.uint8]) -> tuple[Estimate | None, str]:
+        """Find the part: the first acceptable pose that the search proposes; the reason says why there is none."""
+        s = self._state
+        s.frames_without_pose += 1
+        for found in self.search.proposals(image, s, self.components):
+            estimate = self._begin(image, found)
+            if estimate is not None:
+                return estimate, "" if s.is_confirmed else "found, to be confirmed"
+        return None, s.reason
+
+    def _begin(self, image: NDArray[np.uint8], found: FoundPose) -> Estimate | None:
+        """Accept a found pose if it is good enough; one below its lock quality must be confirmed by the next frame."""
+        s = self._state
+        estimate = self._restart(image, found.cam_from_model, rests_on_base=found.rests_on_base)
+        is_possible = self.search.is_possible(estimate.cam_from_model, found.guide_cam_from_model)
+        if estimate.quality < found.min_quality or not is_possible:
+            if found.guide_cam_from_model is None:
+                rejected = RejectedHypothesis(estimate.cam_from_model, estimate.evidence, estimate.quality)
+                s.reason = self.search.diagnose(image, s, rejected)
+            return None
+        if found.guide_cam_from_model is not None:
+            s.reason = ALIGN
+        s.hypotheses = _alternatives_of(found)
+        s.begin(estimate.quality >= found.lock_quality)
+        return estimate
+
+    def _restart(
+        self, image: NDArray[np.uint8], cam_from_model: Array, turn: Turn | None = None, rests_on_base: bool = False
+    ) -> Estimate:
+        """Track from a pose on; nothing is known of the components yet, unless it is the pose so far, turned.
+
+        Where only the base was found, no other component is expected until it is seen.
+        """
+        if rests_on_base:
+            lines = self.components.base_lines(self._part, cam_from_model, self.search.base_part)
+            self.tracker.expect(lines)
+        self.tracker.start(image, cam_from_model)
+        if turn is None:
+            self.components.reset(is_placed=not rests_on_base)
+        else:
+            self.components.turn(turn)
+        return self.tracker.track(image)
+
+    # --- Examine a pose -----------------------------------------------------------------------------------
+
+    def _disambiguate(self, image: NDArray[np.uint8], estimate: Estimate, reason: str) -> tuple[Estimate, str]:
+        """Compare an ambiguous pose with its alternatives until the frames decide between them."""
+        s = self._state
+        if self.search.is_base_due(self.components, estimate.is_restless):
+            estimate = self._recheck_base(image, estimate)
+        if self.components.rests_on_base:
+            estimate = self._recheck_whole(image, estimate)
+        if (turn := self.components.better_turn) is not None:
+            return self._restart(image, estimate.cam_from_model @ turn.model_from_model, turn), reason
+        if not s.hypotheses:
+            return estimate, reason
+        others = s.hypotheses.poses(estimate.cam_from_model)
+        score, *other_scores = self.tracker.scores_near(image, [estimate.cam_from_model, *others])
+        if (better := s.hypotheses.update(score, other_scores)) is not None:
+            s.hypotheses = HypothesisSet([])
+            return self._restart(image, estimate.cam_from_model @ better), reason
+        if not s.hypotheses or reason:
+            return estimate, reason
+        s.apply(Event.CONTRADICTED)
+        poses = "another pose fits" if len(s.hypotheses) == 1 else f"{len(s.hypotheses)} other poses fit"
+        return estimate, f"ambiguous: {poses} as well; show another side"
+
+    def _recheck_base(self, image: NDArray[np.uint8], estimate: Estimate) -> Estimate:
+        """Search again for a part of which little is seen, and go on where it is if that is elsewhere."""
+        found = self.search.find_base(image, [0], self.components)
+        if found is None or self._is_placed_by(found, estimate):
+            return estimate
+        return self._restart(image, found.cam_from_model, rests_on_base=True)
+
+    def _recheck_whole(self, image: NDArray[np.uint8], estimate: Estimate) -> Estimate:
+        """Go on where the whole part is found, if only its base was found before and that elsewhere."""
+        found = self.search.find_whole(image, self.components, estimate.cam_from_model)
+        if found is None or self._is_placed_by(found, estimate):
+            return estimate
+        self._state.hypotheses = _alternatives_of(found)
+        return self._restart(image, found.cam_from_model)
+
+    def _is_placed_by(self, found: FoundPose, estimate: Estimate) -> bool:
+        """Whether a search found the part where it is followed, by which its pose is known to be right."""
+        is_same = self.search.is_same(self.components, found, estimate.cam_from_model)
+        if is_same:
+            self.components.is_placed = True
+        return is_same
+
+    def _check_components(self, image: NDArray[np.uint8], estimate: Estimate, reason: str) -> str:
+        """Check that the components are where the CAD has them; a part with a wrong one is never ``tracked``."""
+        s = self._state
+        s.is_supported = s.state == TrackingState.TRACKED
+        self.components.update(image, estimate.cam_from_model, estimate.quality, s.is_supported)
+        pose, base_part = estimate.cam_from_model, self.search.base_part
+        self.tracker.expect(self.components.present_lines(self._part, pose, base_part))
+        reasons = [text for text in (reason, *self.components.mismatches) if text]
+        if self.components.uncertain and not reasons:
+            reasons = [f"in doubt: {', '.join(self.components.uncertain)}"]
+        if reasons:
+            s.apply(Event.CONTRADICTED)
+        return "; ".join(reasons)
+
+    def _remember(self, image: NDArray[np.uint8], estimate: Estimate) -> None:
+        """Remember pose and appearance of a part that is tracked without doubt."""
+        is_sure = self.state == TrackingState.TRACKED and self._state.is_confirmed
+        if self.options.use_appearance_memory:
+            self.search.memory.learn(image, estimate, is_sure)
+        if is_sure:
+            self._state.last_sure_pose = estimate.cam_from_model
+
+
+def _alternatives_of(found: FoundPose) -> HypothesisSet:
+    return HypothesisSet([invert(found.cam_from_model) @ other for other in found.alternatives])
