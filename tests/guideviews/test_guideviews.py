@@ -17,12 +17,12 @@ from arview.errors import InputError, MismatchError
 from arview.geometry import Array, apply, invert
 from arview.guideviews import GuideViewOptions, GuideViewSet, load_guide_views, make_guide_views
 from arview.guideviews.findings import assessed_guide_views, confusable_pair, uniqueness_findings
-from arview.guideviews.mesh_edges import EDGE_CONTOUR, EDGE_CREASE, EDGE_SHARP, EDGE_SILHOUETTE
 from arview.guideviews.sheet import CONFUSABLE_COLOR, CONTOUR_COLOR, PLAIN_COLOR, contact_sheet
 from arview.guideviews.sphere import icosphere_directions, view_poses
 from arview.guideviews.surface import MAX_FACES, reduced_surface
 from arview.guideviews.uniqueness import assess
 from arview.guideviews.views import guide_camera
+from arview.rendering.mesh_edges import EDGE_CONTOUR, EDGE_CREASE, EDGE_SHARP, EDGE_SILHOUETTE
 from arview.rendering.renderers import ZBufferRenderer
 from helpers.synthetic import assembly, block, bracket
 

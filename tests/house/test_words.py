@@ -43,6 +43,7 @@ OLD_WORDS = (
 OLD = re.compile(rf"_?({'|'.join(OLD_WORDS)})$", re.IGNORECASE)
 KEPT: dict[str, str] = {
     "strip": "the frame counter's strip in a live picture, and the method of a text",
+    "least_squares": "the method of estimation",
 }
 """Words of the list that mean something else where they stand, with what they mean: ``name`` or ``path:name``."""
 

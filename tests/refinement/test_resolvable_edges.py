@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from arview.cad import Component, Model, ViewRange, make_model
 from arview.geometry import Array
 from arview.guideviews import GuideViewOptions, GuideViewSet, make_guide_views
-from arview.guideviews.mesh_edges import EDGE_CONTOUR, EDGE_SHARP
 from arview.refinement.view_model import MIN_SEPARATION, PartView, find_unresolvable
+from arview.rendering.mesh_edges import EDGE_CONTOUR, EDGE_SHARP
 from arview_lab.semisynthetic.solids import Mesh, box, circle, prism, rectangle
 
 SMALL, LARGE = ((-35.0, -15.0), (-35.0, 15.0), (-25.0, 0.0)), (20.0, 0.0)

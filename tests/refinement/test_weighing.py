@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from arview.guideviews.mesh_edges import EDGE_CONTOUR, EDGE_SHARP
 from arview.refinement.gauss_newton import trust_in
 from arview.refinement.modalities.edge import measure_edges, smoothed, weigh_by_color
 from arview.refinement.modalities.region import BINS, EDGE_FUNCTION, ColorModel, log_odds, measure_region, value_bins
 from arview.refinement.projection import ProjectedLines
+from arview.rendering.mesh_edges import EDGE_CONTOUR, EDGE_SHARP
 
 RED, GREEN = (170, 40, 30), (120, 190, 140)
 OUTLINE, HIGHLIGHT = 100.0, 95.0

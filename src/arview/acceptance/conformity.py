@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from arview.acceptance.lengths import K, KnownLength, MeasuredMarks, covariance_of_lengths
+from arview.core.least_squares import covariance_root
 from arview.errors import InputError
 from arview.inspection import Verdict
 from arview.measurement import decide
@@ -263,10 +264,9 @@ def _expected(covariance: Any, is_shared: bool) -> tuple[int, int]:
     if not is_shared:
         low, high = binom.interval(INTERVAL, count, COVERAGE)
         return int(low), int(high)
-    values, vectors = np.linalg.eigh(covariance)
     draws = min(MAX_DRAWS, max(MIN_DRAWS, MAX_VALUES // count))
     noise = np.random.default_rng(0).standard_normal((draws, count))
-    errors = noise @ (np.sqrt(np.maximum(values, 0.0)) * vectors).T
+    errors = noise @ covariance_root(covariance).T
     counts = np.sum(np.abs(errors) <= K * np.sqrt(np.diag(covariance)), axis=1)
     low, high = np.quantile(counts, QUANTILES, method="inverted_cdf")
     return int(low), int(high)

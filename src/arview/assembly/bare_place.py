@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arview.assembly.edge_support import FoundPoints
+from arview.core.least_squares import robust_sigma
 from arview.geometry import Array
 from arview.guideviews import Surface, draw_surface
 from arview.refinement import project
@@ -188,7 +189,7 @@ class BarePlaceMeter:
     def _colours(self, pixels: NDArray[np.float32]) -> _Colours:
         pixels = pixels[:: max(1, len(pixels) // 2000)]
         median = np.median(pixels.astype(np.float64), axis=0)
-        deviation = 1.4826 * np.median(np.abs(pixels - median), axis=0)
+        deviation = np.array([robust_sigma(channel) for channel in (pixels - median).T])
         return _Colours(median, np.clip(deviation, NOISE + SHADING * abs(float(median[0])), MAX_NOISE))
 
     def _compare(
@@ -232,7 +233,7 @@ class BarePlaceMeter:
 
     def _texture_match(self, pixels: NDArray[np.float32], colours: _Colours) -> float:
         """1 where the brightness of some pixels (N,3) varies like that of their face, less where it is smoother."""
-        deviation = 1.4826 * float(np.median(np.abs(pixels[:, 0] - np.median(pixels[:, 0])))) + 1.0
+        deviation = robust_sigma(pixels[:, 0] - np.median(pixels[:, 0])) + 1.0
         reference = float(colours.deviation[0])
         if reference < 2.0 * NOISE:
             return 1.0

@@ -7,7 +7,7 @@ few directions again and again. Points where another component could be mistaken
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,12 +15,10 @@ from numpy.typing import NDArray
 from arview.cad import Model, make_model
 from arview.core.kernel import kernel
 from arview.geometry import Array, apply
-from arview.guideviews import GuideViewSet, facing
-from arview.guideviews.mesh_edges import mesh_edges
-from arview.rendering import Rendering, ZBufferRenderer
+from arview.guideviews import GuideViewSet
+from arview.rendering import EDGE_SILHOUETTE, EdgeSamples, MeshEdges, Rendering, ZBufferRenderer, sample_edges
+from arview.rendering.mesh_edges import mesh_edges
 
-INITIAL_SAMPLES = 4096
-"""Samples for which memory is reserved at first; it doubles when it is full."""
 MIN_FORESHORTENING = 0.05
 """Edges whose image is shorter than this share of their length seen frontally have no stable image direction."""
 
@@ -59,23 +57,9 @@ class VisibleEdges(NamedTuple):
     starts: NDArray[np.int64]
 
 
-class _Mesh(NamedTuple):
-    """`MeshEdges` in a form that kernels take: see there."""
-
-    vertices: Array
-    ends: NDArray[np.int32]
-    faces: NDArray[np.int32]
-    is_sharp: NDArray[np.bool_]
-    normals: Array
-    component: NDArray[np.int32]
-
-
 class _Rendering(NamedTuple):
-    """A rendered view: pose (4,4), focal length and principal point in px, component ids and depth (H,W)."""
+    """A rendered view: component ids and depth (H,W), and the tolerance of depths."""
 
-    cam_from_model: Array
-    focal_px: float
-    center_px: float
     ids: NDArray[np.int16]
     depth_mm: NDArray[np.float32]
     tolerance_mm: float
@@ -106,10 +90,7 @@ class VisibleEdgeCache:
         self._views, self._model = views, model
         self._count = len(model.components)
         self._renderer = ZBufferRenderer(model, views.camera)
-        edges = mesh_edges(model, views.options.crease_angle_deg)
-        self._mesh = _Mesh(
-            edges.vertices_in_model, edges.ends, edges.faces, edges.is_sharp, edges.face_normals, edges.component
-        )
+        self._mesh = mesh_edges(model, views.options.crease_angle_deg)
         self._cached: dict[tuple[int, bytes], VisibleEdges] = {}
         self._incomplete: tuple[bytes, ZBufferRenderer, NDArray[np.int16]] | None = None
 
@@ -148,6 +129,7 @@ class VisibleEdgeCache:
         left = mesh._replace(
             ends=mesh.ends[is_kept],
             faces=mesh.faces[is_kept],
+            is_crease=mesh.is_crease[is_kept],
             is_sharp=mesh.is_sharp[is_kept],
             component=mesh.component[is_kept],
         )
@@ -168,12 +150,33 @@ class VisibleEdgeCache:
         """(C+1,) index of the first point of each component, of those (N,) of sorted points."""
         return np.searchsorted(component, np.arange(self._count + 1)).astype(np.int64)
 
-    def _sampled(self, cam_from_model: Array, image: Rendering, mesh: _Mesh) -> VisibleEdges:
+    def _sampled(self, cam_from_model: Array, image: Rendering, mesh: MeshEdges) -> VisibleEdges:
         camera, center_in_model = self._views.camera, self._views.center_in_model
         ids = image.component_ids
         tolerance_mm = TOLERANCE_PX * float(apply(cam_from_model, center_in_model)[2]) / camera.fx
-        rendering = _Rendering(cam_from_model, camera.fx, camera.cx, ids, image.depth_mm, tolerance_mm)
-        samples = _sample_edges(mesh, rendering)
+        rendering = _Rendering(ids, image.depth_mm, tolerance_mm)
+        along = sample_edges(
+            mesh,
+            mesh.is_sharp,
+            cam_from_model,
+            intrinsics=np.array([camera.fx, camera.fy, camera.cx, camera.cy]),
+            width=camera.width,
+            height=camera.height,
+            spacing_px=1.0,
+            min_depth_mm=1.0,
+            min_foreshortening=MIN_FORESHORTENING,
+        )
+        is_seen = _visible_samples(along, rendering, mesh.component[along.edges])
+        along = EdgeSamples._make(values[is_seen] for values in along)
+        across = along.along_px[:, ::-1] * [-1.0, 1.0]
+        samples = _Samples(
+            along.points_in_model,
+            along.tangents_in_model,
+            along.pixels,
+            normals_px=across / np.linalg.norm(across, axis=1, keepdims=True),
+            depths=along.depths_mm,
+            component=mesh.component[along.edges].astype(np.int16),
+        )
         order = np.argsort(samples.component, kind="stable")
         is_own = _own_samples(samples, rendering, SHARED_PX, SHARED_COS, OCCLUDER_PX)
         beside = [np.round(samples.pixels + sign * SIDE_PX * samples.normals_px).astype(np.intp) for sign in (-1, 1)]
@@ -187,12 +190,6 @@ class VisibleEdgeCache:
             is_own=is_own[order],
             starts=self._starts(component),
         )
-
-
-@kernel
-def _longer(array: NDArray[Any]) -> NDArray[Any]:
-    """A copy of twice the length."""
-    return np.concatenate((array, np.empty_like(array)))
 
 
 @kernel
@@ -219,71 +216,14 @@ def _is_visible(view: _Rendering, column: int, row: int, depth_mm: float, compon
 
 
 @kernel
-def _sample_edges(mesh: _Mesh, view: _Rendering) -> _Samples:
-    """Samples (a `_Samples`), one per pixel, along the visible sharp edges and silhouettes of a `_Mesh`.
-
-    As `mesh_edges.sample_visible_edges`, but with the visibility test of `_is_visible`.
-    """
-    height, width = view.ids.shape
-    r = view.cam_from_model
-    focal, middle = view.focal_px, view.center_px
-    eye = np.empty(3)
-    for k in range(3):
-        eye[k] = -(r[0, k] * r[0, 3] + r[1, k] * r[1, 3] + r[2, k] * r[2, 3])
-    a_cam, b_cam = np.empty(3), np.empty(3)
-    capacity = INITIAL_SAMPLES
-    points, tangents = np.empty((capacity, 3)), np.empty((capacity, 3))
-    pixels, normals_px = np.empty((capacity, 2)), np.empty((capacity, 2))
-    depths, owners = np.empty(capacity), np.empty(capacity, dtype=np.int16)
-    found = 0
-    carry = 0.5
-    for e in range(mesh.ends.shape[0]):
-        a, b = mesh.vertices[mesh.ends[e, 0]], mesh.vertices[mesh.ends[e, 1]]
-        f0, f1 = mesh.faces[e, 0], mesh.faces[e, 1]
-        front0, front1 = facing(eye, a, mesh.normals, f0, f1)
-        silhouette = f1 < 0 or (front0 > 0) != (front1 > 0)
-        if not (silhouette or (mesh.is_sharp[e] and front0 > 0)):
-            continue
-        for k in range(3):
-            a_cam[k] = r[k, 0] * a[0] + r[k, 1] * a[1] + r[k, 2] * a[2] + r[k, 3]
-            b_cam[k] = r[k, 0] * b[0] + r[k, 1] * b[1] + r[k, 2] * b[2] + r[k, 3]
-        if a_cam[2] < 1.0 or b_cam[2] < 1.0:
-            continue
-        du = focal * (b_cam[0] / b_cam[2] - a_cam[0] / a_cam[2])
-        dv = focal * (b_cam[1] / b_cam[2] - a_cam[1] / a_cam[2])
-        length = np.sqrt(du * du + dv * dv)
-        size = np.sqrt((b[0] - a[0]) ** 2 + (b[1] - a[1]) ** 2 + (b[2] - a[2]) ** 2)
-        if length < MIN_FORESHORTENING * focal * size / a_cam[2]:
-            continue
-        # The remainder is carried to the next edge, so that short edges get their share of samples.
-        wanted = length + carry
-        count = int(wanted)
-        carry = wanted - count
-        for i in range(count):
-            t = (i + 0.5) / count
-            z = a_cam[2] + t * (b_cam[2] - a_cam[2])
-            u = focal * (a_cam[0] + t * (b_cam[0] - a_cam[0])) / z + middle
-            v = focal * (a_cam[1] + t * (b_cam[1] - a_cam[1])) / z + middle
-            iu, iv = int(np.round(u)), int(np.round(v))
-            if iu < 1 or iv < 1 or iu >= width - 1 or iv >= height - 1:
-                continue
-            if not _is_visible(view, iu, iv, z, mesh.component[e], silhouette):
-                continue
-            if found == capacity:
-                capacity *= 2
-                points, tangents, pixels = _longer(points), _longer(tangents), _longer(pixels)
-                normals_px, depths, owners = _longer(normals_px), _longer(depths), _longer(owners)
-            for k in range(3):
-                points[found, k] = a[k] + t * (b[k] - a[k])
-                tangents[found, k] = (b[k] - a[k]) / size
-            pixels[found, 0], pixels[found, 1] = u, v
-            normals_px[found, 0], normals_px[found, 1] = -dv / length, du / length
-            depths[found] = z
-            owners[found] = mesh.component[e]
-            found += 1
-    return _Samples(
-        points[:found], tangents[:found], pixels[:found], normals_px[:found], depths[:found], owners[:found]
-    )
+def _visible_samples(samples: EdgeSamples, view: _Rendering, owners: NDArray[np.int32]) -> NDArray[np.bool_]:
+    """(N,) whether samples of components (N,) are visible in a view, see `_is_visible`."""
+    seen = np.zeros(len(owners), dtype=np.bool_)
+    for i in range(len(owners)):
+        column, row = int(np.round(samples.pixels[i, 0])), int(np.round(samples.pixels[i, 1]))
+        is_silhouette = samples.kinds[i] & EDGE_SILHOUETTE > 0
+        seen[i] = _is_visible(view, column, row, samples.depths_mm[i], owners[i], is_silhouette)
+    return seen
 
 
 @kernel

@@ -8,8 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arview.cad.fitness import face_areas
+from arview.cad.mesh_topology import edge_faces
 from arview.cad.model import Component
 from arview.cad.part import Datum, Part
+from arview.core.least_squares import fit_circle
 from arview.geometry import Array
 
 SHARP_DEG = 25.0
@@ -85,13 +87,9 @@ def _sharp_edges(vertices: Array, faces: NDArray[np.int64], sharp_deg: float) ->
     a, b, c = vertices[faces].transpose(1, 0, 2)
     normals = np.cross(b - a, c - a)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
-    ends = np.sort(np.stack([faces.ravel(), np.roll(faces, -1, axis=1).ravel()], axis=1), axis=1)
-    unique, inverse, counts = np.unique(ends, axis=0, return_inverse=True, return_counts=True)
-    order = np.argsort(inverse.ravel(), kind="stable")
-    first = np.concatenate([[0], np.cumsum(counts)[:-1]])[counts == 2]
-    owner = order // 3
-    cosine = np.einsum("ij,ij->i", normals[owner[first]], normals[owner[first + 1]])
-    return np.asarray(unique[counts == 2][cosine < np.cos(np.deg2rad(sharp_deg))])
+    edges = edge_faces(faces)
+    cosine = np.einsum("ij,ij->i", normals[edges.faces[:, 0]], normals[edges.faces[:, 1]])
+    return edges.ends[(edges.face_count == 2) & (cosine < np.cos(np.deg2rad(sharp_deg)))]
 
 
 def _fitted_rim(points: Array, round_share: float) -> RoundEdge | None:
@@ -101,15 +99,12 @@ def _fitted_rim(points: Array, round_share: float) -> RoundEdge | None:
     if sizes[1] < 1e-9:
         return None
     flat = (points - middle) @ axes[:2].T
-    # Circle of least squares (Kåsa 1976): x² + y² = 2 a x + 2 b y + c.
-    system = np.column_stack([2.0 * flat, np.ones(len(flat))])
-    x, y, rest = np.linalg.lstsq(system, (flat**2).sum(axis=1), rcond=None)[0]
-    radius = float(np.sqrt(max(rest + x * x + y * y, 0.0)))
-    away = np.abs(np.hypot(*(flat - [x, y]).T) - radius)
+    center, radius = fit_circle(flat)
+    away = np.abs(np.hypot(*(flat - center).T) - radius)
     height = np.abs((points - middle) @ axes[2])
     if radius <= 0 or max(away.max(), height.max()) > round_share * radius:
         return None
-    return RoundEdge(middle + x * axes[0] + y * axes[1], axes[2], radius)
+    return RoundEdge(middle + center @ axes[:2], axes[2], radius)
 
 
 def _round_problem(datum: Datum, rims: list[RoundEdge]) -> str:

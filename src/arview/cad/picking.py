@@ -13,8 +13,10 @@ from numpy.typing import NDArray
 
 from arview.cad.datum_check import RoundEdge, find_rims
 from arview.cad.fitness import face_areas
+from arview.cad.mesh_topology import edge_faces
 from arview.cad.model import Component
 from arview.cad.part import DatumFeature
+from arview.core.least_squares import fit_circle
 from arview.errors import InputError
 from arview.geometry import Array
 
@@ -94,13 +96,10 @@ def _normals(vertices: Array, faces: NDArray[np.int64]) -> Array:
 
 def _neighbours(faces: NDArray[np.int64]) -> NDArray[np.int64]:
     """(F,3) face across the edge from corner k to the next one; -1 where there is none or more than one."""
-    ends = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1).reshape(-1, 2), axis=1)
-    _, inverse, counts = np.unique(ends, axis=0, return_inverse=True, return_counts=True)
-    order = np.argsort(inverse.ravel(), kind="stable")
-    starts = np.concatenate([[0], np.cumsum(counts)[:-1]])
-    first, second = order[starts[counts == 2]], order[starts[counts == 2] + 1]
-    across = np.full(len(ends), -1, dtype=np.int64)
-    across[first], across[second] = second // 3, first // 3
+    edges = edge_faces(faces)
+    is_shared = edges.face_count == 2
+    across = np.full(faces.size, -1, dtype=np.int64)
+    across[edges.sides[is_shared]] = edges.faces[is_shared, ::-1]
     return across.reshape(-1, 3)
 
 
@@ -151,13 +150,11 @@ def _cylinder(
     axis = axes[2]
     corners = vertices[np.unique(faces[smooth])]
     flat = corners @ axes[:2].T
-    system = np.column_stack([2.0 * flat, np.ones(len(flat))])
-    x, y, rest = np.linalg.lstsq(system, (flat**2).sum(axis=1), rcond=None)[0]
-    radius = float(np.sqrt(max(rest + x * x + y * y, 0.0)))
-    if radius <= 0 or np.abs(np.hypot(*(flat - [x, y]).T) - radius).max() > ROUND_SHARE * radius:
+    center, radius = fit_circle(flat)
+    if radius <= 0 or np.abs(np.hypot(*(flat - center).T) - radius).max() > ROUND_SHARE * radius:
         return None
     along = corners @ axis
-    foot = x * axes[0] + y * axes[1] + along.min() * axis
+    foot = center @ axes[:2] + along.min() * axis
     offset = point - foot
     distance = abs(float(np.linalg.norm(offset - (offset @ axis) * axis)) - radius)
     return PickedFeature("cylinder", foot, axis, 2.0 * radius, float(np.ptp(along)), distance)

@@ -19,6 +19,7 @@ from arview.calibration.fisheye import adjust_fisheye
 from arview.calibration.projection import PARAMETERS_OF, CalibratedLens, lens_of, project
 from arview.calibration.views import MIN_CORNERS, BoardView
 from arview.camera import MAX_HALF_ANGLE_DEG, Camera
+from arview.core.least_squares import without_span
 from arview.errors import InputError
 from arview.geometry import Array, rigid
 
@@ -119,8 +120,7 @@ def information(view: BoardView, camera: Camera, cam_from_board: Array) -> tuple
     """Information (P,P) on the intrinsics of a view's corners at 1 px, its pose unknown, and their Jacobian (N·2,P)."""
     _, intrinsics, pose = project(view.points_in_board, camera, cam_from_board)
     # Changes that a change of the pose explains as well carry no information on the camera.
-    basis, _ = np.linalg.qr(pose)
-    left = intrinsics - basis @ (basis.T @ intrinsics)
+    left = without_span(pose, intrinsics)
     return left.T @ left, left
 
 
@@ -138,9 +138,7 @@ def pixel_uncertainty(solution: Solution, pixels: Array) -> Array:
         _, intrinsics, pose = project(rays[seen], solution.camera, np.eye(4))
     if not all(np.isfinite(one).all() for one in (solution.covariance, intrinsics, pose)):
         return np.full(len(pixels), np.inf)
-    basis, _ = np.linalg.qr(pose[:, :3])
-    field = intrinsics - basis @ (basis.T @ intrinsics)
-    blocks = field.reshape(-1, 2, intrinsics.shape[1])
+    blocks = without_span(pose[:, :3], intrinsics).reshape(-1, 2, intrinsics.shape[1])
     covariance = np.einsum("nij,jk,nlk->nil", blocks, solution.covariance, blocks)
     uncertainty = np.full(len(pixels), np.nan)
     uncertainty[seen] = K * np.sqrt(np.maximum(np.linalg.eigvalsh(covariance)[:, -1], 0.0))
@@ -160,9 +158,7 @@ def pixel_difference(camera: Camera, other: Camera, pixels: Array) -> Array:
     """(N,2) px from where ``camera`` sees rays to where ``other`` does, at pixels (N,2), less the best rotation."""
     rays = camera.unproject(pixels)
     _, _, pose = project(rays, camera, np.eye(4))
-    basis, _ = np.linalg.qr(pose[:, :3])
-    moved = (other.project(rays) - pixels).ravel()
-    return np.asarray(moved - basis @ (basis.T @ moved)).reshape(-1, 2)
+    return without_span(pose[:, :3], (other.project(rays) - pixels).ravel()).reshape(-1, 2)
 
 
 def picture_grid(width: int, height: int, columns: int = 9, rows: int = 7) -> Array:

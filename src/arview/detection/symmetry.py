@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from arview.geometry import Array, exp_so3
-from arview.guideviews import EDGE_SHARP, GuideViewSet
+from arview.guideviews import GuideViewSet
 from arview.refinement import EdgeSteps
+from arview.rendering import EDGE_SHARP
 
 USUAL_ANGLES_DEG, FIFTHS_DEG = sorted({*range(30, 360, 30), *range(45, 360, 45)}), range(72, 360, 72)
 """Angles that are tried about the model's axes."""

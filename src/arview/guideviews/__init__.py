@@ -14,12 +14,6 @@ if TYPE_CHECKING:
     from arview.guideviews.findings import uniqueness_findings as uniqueness_findings
     from arview.guideviews.look_alikes import PartLikeness as PartLikeness
     from arview.guideviews.look_alikes import compare_parts as compare_parts
-    from arview.guideviews.mesh_edges import EDGE_CONTOUR as EDGE_CONTOUR
-    from arview.guideviews.mesh_edges import EDGE_CREASE as EDGE_CREASE
-    from arview.guideviews.mesh_edges import EDGE_SHARP as EDGE_SHARP
-    from arview.guideviews.mesh_edges import EDGE_SILHOUETTE as EDGE_SILHOUETTE
-    from arview.guideviews.mesh_edges import facing as facing
-    from arview.guideviews.mesh_edges import sample_visible_edges as sample_visible_edges
     from arview.guideviews.report import uniqueness_report as uniqueness_report
     from arview.guideviews.sheet import contact_sheet as contact_sheet
     from arview.guideviews.sheet import view_tile as view_tile
@@ -52,14 +46,6 @@ __getattr__, __dir__, __all__ = lazy_door(
         "look_alikes": (
             "PartLikeness",
             "compare_parts",
-        ),
-        "mesh_edges": (
-            "EDGE_CONTOUR",
-            "EDGE_CREASE",
-            "EDGE_SHARP",
-            "EDGE_SILHOUETTE",
-            "facing",
-            "sample_visible_edges",
         ),
         "report": ("uniqueness_report",),
         "sheet": (

@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from arview.camera import Camera
 from arview.core.kernel import kernel
 from arview.geometry import Array
-from arview.guideviews.mesh_edges import EDGE_CONTOUR, MeshEdges, ViewEdgeSamples, sample_visible_edges
-from arview.rendering import Rendering
+from arview.rendering import EDGE_CONTOUR, MeshEdges, Rendering, ViewEdgeSamples, sample_visible_edges
 
 MAX_SHIFT_PX = 1.6
 """Largest distance over which a contour pixel is moved onto a sample of a mesh edge."""

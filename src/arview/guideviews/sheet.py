@@ -10,10 +10,9 @@ from arview.cad import Model
 from arview.errors import InputError
 from arview.geometry import apply
 from arview.guideviews.findings import azimuths_deg, confusable_pair, elevations_deg
-from arview.guideviews.mesh_edges import EDGE_SHARP
 from arview.guideviews.uniqueness import CONFUSABLE_LIKENESS, PLAIN_LINES, Uniqueness, assess
 from arview.guideviews.views import GuideViewSet
-from arview.rendering import ZBufferRenderer
+from arview.rendering import EDGE_SHARP, ZBufferRenderer
 
 PAPER = (250, 250, 250)
 INK = (40, 40, 40)

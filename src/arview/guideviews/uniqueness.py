@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arview.geometry import Array
-from arview.guideviews.mesh_edges import EDGE_CONTOUR, EDGE_SHARP
 from arview.guideviews.sphere import assessed_directions
 from arview.guideviews.views import GuideView, GuideViewSet
+from arview.rendering import EDGE_CONTOUR, EDGE_SHARP
 
 PLAIN_LINES = 12.0
 """Number of distinct lines below which a view is plain, as those of boxes, plates and cylinders are."""

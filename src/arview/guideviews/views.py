@@ -20,12 +20,12 @@ from arview.core.progress import StepProgress
 from arview.errors import InputError, MismatchError
 from arview.geometry import Array
 from arview.guideviews.extract import ViewFeatures, extract_features
-from arview.guideviews.mesh_edges import mesh_edges
 from arview.guideviews.sphere import directions_in_range, view_poses
 from arview.guideviews.store import read_arrays, write_arrays
 from arview.guideviews.surface import Surface, reduced_surface, surface_about
 from arview.guideviews.validity import check_arrays, check_poses
 from arview.rendering import Rendering, open_renderer
+from arview.rendering.mesh_edges import mesh_edges
 
 FORMAT_VERSION = 2
 _UNIT16 = 32767.0

@@ -14,6 +14,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from arview.core.least_squares import row_space
 from arview.errors import InputError
 from arview.geometry import Array, exp_so3, invert, rigid
 
@@ -101,8 +102,7 @@ def moved_to(
     moved = np.concatenate([twist[:3], twist[3:] + exp_so3(twist[:3]) @ arm - arm])
     project, free = np.eye(6), undetermined
     if len(undetermined):
-        _, sizes, basis = np.linalg.svd((undetermined / unit) @ change.T * unit)
-        free = basis[: np.count_nonzero(sizes > 1e-9)]
+        free = row_space((undetermined / unit) @ change.T * unit)
         project = (np.eye(6) - free.T @ free) / unit[:, None] * unit
     both = project @ change
     return project @ moved, [both @ one @ both.T for one in covariances], free

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.cad import Component
+from arview.cad import Component, edge_faces
 from arview.geometry import Array
 
 _WELD_MM = 1e-4
@@ -50,18 +50,15 @@ def topology(component: Component) -> Topology:
     faces, corners, cross = faces[solid], corners[solid], cross[solid]
     normals = cross / area[solid][:, None]
 
-    half = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    face_of_half = np.tile(np.arange(len(faces)), 3)
-    ends, edge_of_half, count = np.unique(np.sort(half, axis=1), axis=0, return_inverse=True, return_counts=True)
-    edge_of_half = edge_of_half.reshape(-1)
-    order = np.argsort(edge_of_half, kind="stable")
-    start = np.cumsum(count) - count
-    second = np.minimum(start + 1, max(0, len(order) - 1))
-    edge_faces = np.stack([face_of_half[order[start]], np.where(count == 2, face_of_half[order[second]], -1)], axis=1)
-    direction = np.bincount(edge_of_half, weights=np.where(half[:, 0] < half[:, 1], 1.0, -1.0))
-    is_closed = len(faces) > 0 and bool(np.all(count == 2) and np.all(direction == 0))
+    edges = edge_faces(faces)
+    starts = faces.ravel()[edges.sides]
+    is_closed = len(faces) > 0 and bool(np.all((edges.face_count == 2) & (starts[:, 0] != starts[:, 1])))
     is_inside_out = is_closed and float(np.sum(corners[:, 0] * cross)) < 0.0
-    return Topology(vertices, faces, -normals if is_inside_out else normals, ends, edge_faces, is_closed, is_inside_out)
+    joined = edges.faces.copy()
+    joined[edges.face_count != 2, 1] = -1
+    return Topology(
+        vertices, faces, -normals if is_inside_out else normals, edges.ends, joined, is_closed, is_inside_out
+    )
 
 
 def anchor_in_model(component: Component, shape: Topology) -> Array:

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from arview.core.least_squares import robust_sigma
 from arview.geometry import Array, skew
 from arview.reconstruction.colmap import import_pycolmap
 from arview.reconstruction.types import SparseModel
@@ -54,7 +55,7 @@ def _noise_variance(sparse: SparseModel) -> float:
     residuals = reprojection_residuals(sparse)
     unknowns = 3 * len(sparse.points_in_scan) + 6 * len(sparse.photos)
     fit = residuals.size / max(1, residuals.size - unknowns)  # the fitted unknowns absorb a share of the noise
-    return float((1.4826 * np.median(np.abs(residuals))) ** 2 * fit)
+    return float(robust_sigma(residuals) ** 2 * fit)
 
 
 def reprojection_residuals(sparse: SparseModel) -> Array:

@@ -20,7 +20,7 @@ import numpy as np
 
 from arview.camera import Camera
 from arview.errors import InputError
-from arview.geometry import Array, invert, rigid
+from arview.geometry import Array, invert, orthonormalise, rigid
 from arview.reconstruction.colmap import HALF_PX, import_pycolmap
 from arview.reconstruction.types import Photo
 
@@ -251,7 +251,7 @@ def _rigid_of(matrix: Array, path: Path) -> Array:
     """A 4×4 pose whose rotation is made exactly orthonormal. Raises InputError where it is not a pose."""
     if matrix.shape not in ((4, 4), (3, 4)) or not np.isfinite(matrix).all():
         raise InputError(f"{path}: a pose is not a 4×4 matrix of numbers")
-    u, s, vt = np.linalg.svd(matrix[:3, :3])
+    s = np.linalg.svd(matrix[:3, :3], compute_uv=False)
     if s.min() <= 0 or s.max() / s.min() > 1.01 or np.linalg.det(matrix[:3, :3]) < 0:
         raise InputError(f"{path}: the matrix of a pose is not a rotation")
-    return rigid(u @ vt, matrix[:3, 3])
+    return orthonormalise(rigid(matrix[:3, :3], matrix[:3, 3]))

@@ -14,8 +14,9 @@ from pathlib import Path
 
 import numpy as np
 
+from arview.core.least_squares import fit_similarity
 from arview.errors import CannotMeasureError
-from arview.geometry import Array, rigid
+from arview.geometry import Array
 from arview.reconstruction.colmap import import_pycolmap, read_reconstruction, sparse_model_of
 from arview.reconstruction.covariance import pose_covariance
 from arview.reconstruction.groups import MIN_SHARED_POINTS, linked_groups
@@ -93,17 +94,9 @@ def _listed(photo: PosedPhoto) -> Photo:
 
 
 def onto(sparse: SparseModel, whole: SparseModel) -> tuple[float, Array]:
-    """Scale and rigid motion (4,4) that bring a model onto another one, by the centres of the photos of both.
-
-    Umeyama 1991.
-    """
+    """Scale and rigid motion (4,4) that bring a model onto another one, by the centres of the photos of both."""
     target = {photo.name: photo.centre_in_scan for photo in whole.photos}
     common = [photo for photo in sparse.photos if photo.name in target]
     ours = np.array([photo.centre_in_scan for photo in common])
     theirs = np.array([target[photo.name] for photo in common])
-    middle, their_middle = ours.mean(axis=0), theirs.mean(axis=0)
-    u, _, vt = np.linalg.svd((theirs - their_middle).T @ (ours - middle))
-    rotation = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
-    turned = (ours - middle) @ rotation.T
-    scale = float(np.sum(turned * (theirs - their_middle)) / np.sum(turned**2))
-    return scale, rigid(rotation, their_middle - scale * rotation @ middle)
+    return fit_similarity(ours, theirs)

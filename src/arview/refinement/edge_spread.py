@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arview.core.kernel import kernel
-from arview.guideviews import EDGE_CONTOUR, EDGE_SHARP
 from arview.refinement.kernels import nearest_view
 from arview.refinement.projection import ViewArrays, project_lines
+from arview.rendering import EDGE_CONTOUR, EDGE_SHARP
 
 SPREAD_REACH = 12
 """Samples to either side of an edge, one pixel apart."""

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from arview.core.kernel import kernel
 from arview.geometry import Array
-from arview.guideviews import EDGE_CONTOUR, EDGE_SHARP
 from arview.refinement.modalities.edge import EdgeProfiles
 from arview.refinement.modalities.region import RegionLines
+from arview.rendering import EDGE_CONTOUR, EDGE_SHARP
 
 DECISION_SCORE = 0.58
 """Score that separates right from wrong poses best on the recorded sequences; their quality is 0.5 there."""

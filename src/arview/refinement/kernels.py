@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arview.core.kernel import kernel
-from arview.guideviews import EDGE_CONTOUR, EDGE_SHARP
 from arview.refinement.evidence import edge_evidence, region_evidence
 from arview.refinement.gauss_newton import apply_twist, solve_step, trust_in
 from arview.refinement.modalities.edge import HYPOTHESES, EdgeProfiles, add_edges, measure_edges, weigh_by_color
@@ -17,6 +16,7 @@ from arview.refinement.modalities.texture import TextureMatches
 from arview.refinement.modalities.texture_matching import add_matches
 from arview.refinement.projection import ProjectedLines, ViewArrays, project_lines
 from arview.refinement.schedules import StageTable
+from arview.rendering import EDGE_CONTOUR, EDGE_SHARP
 
 STRENGTH_HALF = 15.0
 """Strength of an edge step, in grey levels over two pixels, that has half the weight of a very strong one."""

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from arview.camera import Camera
 from arview.geometry import Array
-from arview.guideviews import EDGE_CONTOUR, EDGE_SHARP
 from arview.refinement.edge_spread import edge_spread
 from arview.refinement.evidence import EdgeSteps, PoseEvidence
 from arview.refinement.kernels import ModalityWeights, count_colors, run_edge_steps, run_evidence, run_stages
@@ -25,6 +24,7 @@ from arview.refinement.modalities.texture import TextureMatches
 from arview.refinement.projection import intrinsics_of
 from arview.refinement.schedules import Stage, stage_table
 from arview.refinement.view_model import PartView
+from arview.rendering import EDGE_CONTOUR, EDGE_SHARP
 
 NO_MATCHES = TextureMatches(np.empty((0, 3)), np.empty((0, 2)), np.empty(0), 0)
 """Matches of a frame in which texture is not used."""

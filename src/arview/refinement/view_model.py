@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 
 from arview.core.kernel import kernel
 from arview.geometry import invert, rigid
-from arview.guideviews import EDGE_CONTOUR, EDGE_SHARP, GuideViewSet
+from arview.guideviews import GuideViewSet
 from arview.refinement.modalities.shading import corner_normals, curved_share
 from arview.refinement.projection import ViewArrays
+from arview.rendering import EDGE_CONTOUR, EDGE_SHARP
 
 MIN_SEPARATION = 0.035
 """Edges closer to each other than this, in diameters of the part, are unresolvable: 3.4 px where the diameter is 96 px,

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from arview.core.kernel import kernel
 from arview.core.onnx_session import padded_to_multiple
 from arview.detection.features.response_maps import ORIENTATIONS
-from arview.guideviews import EDGE_CONTOUR, EDGE_SHARP
 from arview.refinement import ViewArrays, nearest_view, project_lines
+from arview.rendering import EDGE_CONTOUR, EDGE_SHARP
 from arview.weights import load_network
 
 MAX_SIDE_PX = 640

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from arview.core.kernel import kernel
 from arview.geometry import Array
-from arview.guideviews import EDGE_CONTOUR, EDGE_SHARP
 from arview.refinement import ViewArrays, nearest_view, project_lines
+from arview.rendering import EDGE_CONTOUR, EDGE_SHARP
 
 Channel = NDArray[np.float32]
 

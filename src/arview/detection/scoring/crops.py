@@ -18,8 +18,9 @@ from arview.core.kernel import kernel
 from arview.detection.features.edge_net import SOLID_CHANNEL
 from arview.detection.features.image_pyramid import ImagePyramid, steps_to
 from arview.geometry import Array
-from arview.guideviews import EDGE_CONTOUR, EDGE_SHARP, draw_surface
+from arview.guideviews import draw_surface
 from arview.refinement import PartView, ViewArrays, nearest_view, project_lines
+from arview.rendering import EDGE_CONTOUR, EDGE_SHARP
 
 CROP_SIDE_PX, CROP_RADIUS_PX = 80, 35.0
 """Side of the crop around a pose, and half the part's diameter in it."""

@@ -22,8 +22,8 @@ from arview.core.parallel import pool
 from arview.detection.features.edge_net import SOLID_CHANNEL
 from arview.detection.features.image_pyramid import ImagePyramid, PyramidLevel, steps_to
 from arview.geometry import Array
-from arview.guideviews import EDGE_CONTOUR, EDGE_SHARP
 from arview.refinement import PartView, ViewArrays, nearest_view, project_lines
+from arview.rendering import EDGE_CONTOUR, EDGE_SHARP
 from arview.weights import load_arrays
 
 ROUGH, FINE = ("rough",), ("fine", "close")

@@ -19,8 +19,9 @@ from arview.core.kernel import kernel
 from arview.detection.features.response_maps import orientation_bins
 from arview.errors import InputError
 from arview.geometry import Array, rolls_between
-from arview.guideviews import EDGE_CONTOUR, GuideViewSet, ViewFeatures, icosphere_directions, view_lines
+from arview.guideviews import GuideViewSet, ViewFeatures, icosphere_directions, view_lines
 from arview.refinement import project_lines
+from arview.rendering import EDGE_CONTOUR
 
 FIRST_POINTS = 32
 """Points of a template that are summed everywhere; the others are summed only where the first ones score well."""

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from arview.cad import Component, Model, Part
+from arview.core.least_squares import orthogonal_complement, row_space
 from arview.errors import InputError
 from arview.geometry import Array, apply, invert, rigid
 from arview.measurement.cloud.mesh_surface import MeshSurface
@@ -165,10 +166,7 @@ def spin_moves(component: Component, surface: MeshSurface, part: Part | None, mi
         axis = np.array(known.axis_in_model)
         declared = np.concatenate([radius_mm * axis, np.cross(axis, center - np.array(known.through_in_model))])
         moves = np.concatenate([moves, declared[None] / np.linalg.norm(declared)])
-    if len(moves) == 0:
-        return np.zeros((0, 6))
-    _, values, vectors = np.linalg.svd(moves, full_matrices=False)
-    return vectors[values > 0.1]
+    return row_space(moves, 0.1)
 
 
 def cloud_component(name: str, model: Model, part: Part | None, views: SurfaceVisibility | None) -> CloudComponent:
@@ -329,7 +327,7 @@ def _register(c: CloudComponent, own: CloudPoints, start: Array | None) -> Regis
     fixed = c.spins
     starts = _starts(c.center, radius, BAND_MM) if start is None else [start]
     for _ in range(6):
-        free = _orthogonal_complement(fixed) / scales
+        free = orthogonal_complement(fixed) / scales
         fit = register_from_starts(
             own.points,
             c.surface,
@@ -375,18 +373,10 @@ def _starts(center: Array, radius: float, band_mm: float) -> list[Array]:
     return [move_about(center, twist) for twist in twists]
 
 
-def _orthogonal_complement(fixed: Array) -> Array:
-    """(6−K,6) orthonormal basis of the directions orthogonal to ``fixed`` (K,6)."""
-    if len(fixed) == 0:
-        return np.eye(6)
-    _, values, vectors = np.linalg.svd(fixed, full_matrices=True)
-    return vectors[int(np.count_nonzero(values > 1e-6)) :]
-
-
 def _move(c: CloudComponent, fit: Registration, support: float) -> Move:
     """The registration as a move, with notes about what may be wrong."""
     scales = np.array([c.radius_mm] * 3 + [1.0] * 3)
-    undetermined = _orthogonal_complement(fit.free)
+    undetermined = orthogonal_complement(fit.free)
     determined = np.eye(6) - undetermined.T @ undetermined
     twist = determined @ (twist_about(c.center, invert(fit.surface_from_points)) * scales) / scales
     covariance = determined @ (fit.covariance * np.outer(scales, scales)) @ determined / np.outer(scales, scales)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from arview.cad import Model
 from arview.core.atomic import write_file
+from arview.core.least_squares import robust_sigma
 from arview.errors import InputError
 from arview.geometry import Array, apply, look_at
 from arview.inspection import DistanceStatistics
@@ -187,7 +188,7 @@ def _statistics(name: str, distances: Array, reach_mm: float) -> DistanceStatist
 
 def full_width_at_half_maximum(values: Array, reach: float) -> float:
     """Width of the peak of a smoothed histogram of values (N,) at half its height."""
-    spread = 1.4826 * float(np.median(np.abs(values - np.median(values))))
+    spread = robust_sigma(values - np.median(values))
     span = min(reach, max(6.0 * spread, 1e-4))
     edges = np.linspace(np.median(values) - span, np.median(values) + span, _BINS + 1)
     count, _ = np.histogram(values, edges)

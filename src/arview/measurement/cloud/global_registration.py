@@ -12,12 +12,12 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from arview.cad import Model
+from arview.core.least_squares import TUKEY_SIGMAS
 from arview.core.parallel import pool
 from arview.errors import InputError
 from arview.geometry import Array, apply, exp_so3, invert, rigid
 from arview.measurement.cloud.mesh_surface import MeshSurface
 from arview.measurement.cloud.pair_registration import find_by_pairs
-from arview.measurement.cloud.registration import TUKEY_SIGMAS
 from arview.reconstruction import DenseCloud, Similarity
 
 POINTS = 4000

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from arview.core.least_squares import nearest_covariance
 from arview.geometry import Array
 
 _SHARES = np.array([0.0, 0.03, 0.1, 0.2, 0.35, 0.5, 0.7, 0.85, 0.95])
@@ -100,9 +101,7 @@ def spread_of_sum(points: Array, normals: Array, pull: Array, noise: NoiseModel,
     pairs = len(points) * (len(points) - 1) / max(len(few) * (len(few) - 1), 1)
     shared = noise.shared * (pull @ pull.T + pairs * p @ correlation @ p.T)
     total = noise.sigma_mm**2 * (own + shared)
-    values, vectors = np.linalg.eigh(total)
-    floor = np.maximum(values, 0.0)
-    return np.asarray((vectors * floor) @ vectors.T)
+    return nearest_covariance(total)
 
 
 def _apart(a: Array, b: Array) -> Array:

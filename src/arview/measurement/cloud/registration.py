@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from arview.core.least_squares import orthogonal_complement, robust_sigma, row_space, tukey_weights
 from arview.errors import InputError
 from arview.geometry import Array, apply, exp_so3, log_so3, rigid
 from arview.measurement.cloud.mesh_surface import MeshSurface
@@ -21,14 +22,11 @@ from arview.measurement.cloud.noise import NoiseModel, estimate_noise, spread_of
 
 NAMES = ("rx", "ry", "rz", "tx", "ty", "tz")
 """Degrees of freedom, in the order of a twist."""
-TUKEY_SIGMAS = 4.685
-"""Width of Tukey's kernel in standard deviations: 95 % efficiency for normal errors. The kernel starts as wide as the
-first distance and shrinks to the noise; narrow from the start, it would take a face displaced by more than the noise
-for an outlier."""
 DISTANCE_SIGMAS = 6.0
 """Maximum distance in widths of the kernel."""
 SHRINK = 1.0 / 3.0
-"""Factor by which the width decreases in each iteration, until it reaches the noise."""
+"""Factor by which the kernel's width, at first that of the largest distance, decreases in each iteration until it
+reaches the noise; narrow from the start, it would take a face displaced by more than the noise for an outlier."""
 MIN_NORMAL_COSINE = 0.5
 """Points whose normal makes a larger angle with the surface's belong to another face."""
 MIN_INFORMATION = 1e-4
@@ -117,7 +115,7 @@ class Registration:
     @property
     def naive_covariance(self) -> Array:
         """(6,6) covariance for independent errors, for comparison; far too small for real clouds."""
-        basis = _observable_directions(self.free, self.undetermined) * _scales(self.radius_mm)
+        basis = orthogonal_complement(self.undetermined, self.free) * _scales(self.radius_mm)
         return basis.T @ np.linalg.inv(basis @ self.information @ basis.T) @ basis * self.sigma_mm**2
 
 
@@ -194,7 +192,7 @@ def register_to_surface(
     )
     center = apply(pose, points).mean(axis=0) if center is None else np.asarray(center, dtype=np.float64)
     radius = radius_mm or float(np.sqrt(np.mean(np.sum((apply(pose, points) - center) ** 2, axis=1)))) or 1.0
-    basis = np.eye(6) if free is None else _orthonormal(free / _scales(radius))
+    basis = np.eye(6) if free is None else row_space(free / _scales(radius))
     problem = _Problem(points, normals, base, surface, usable_faces, center, radius, basis=basis, options=o)
     width, hint, converged, iterations = o.first_distance_mm / DISTANCE_SIGMAS, None, False, 0
     while iterations < o.max_iterations:
@@ -327,8 +325,8 @@ class _Problem:
         if found < max(6, o.min_points // 4):
             raise InputError(f"registration: {found} of {len(moved)} points are within {reach:.2f} mm of the surface")
         size = np.abs(np.where(counts, residuals, 0.0)) * np.sqrt(self.base)
-        sigma = max(1.4826 * float(np.median(size[counts])), 1e-9)
-        weights = np.where(counts, _tukey(size / max(sigma, width, o.min_width_mm)), 0.0) * self.base
+        sigma = max(robust_sigma(size[counts]), 1e-9)
+        weights = np.where(counts, tukey_weights(size / max(sigma, width, o.min_width_mm)), 0.0) * self.base
         normals = np.where(counts[:, None], closest.normals, 0.0)
         rows = np.hstack([np.cross(moved - self.center, normals) / self.radius, normals])
         weighted = rows * weights[:, None]
@@ -373,7 +371,7 @@ class _Problem:
             center=self.center,
             radius_mm=self.radius,
             free=self.basis,
-            undetermined=_orthogonal_complement(self.basis, determined),
+            undetermined=orthogonal_complement(determined, self.basis),
             information=system.hessian / np.outer(scales, scales),
             covariance=scatter * np.outer(scales, scales),
             noise=noise,
@@ -387,11 +385,6 @@ class _Problem:
         )
 
 
-def _tukey(size: Array) -> Array:
-    """Tukey's weights 0–1 for residuals in standard deviations."""
-    return np.where(size < TUKEY_SIGMAS, (1.0 - np.minimum(size / TUKEY_SIGMAS, 1.0) ** 2) ** 2, 0.0)
-
-
 def _cost(found: Registration, limit: float) -> float:
     """Mean squared residual, each limited to ``limit`` mm; points without a surface in reach count as the limit."""
     size = np.abs(np.nan_to_num(found.residuals, nan=np.inf))
@@ -401,20 +394,3 @@ def _cost(found: Registration, limit: float) -> float:
 def _scales(radius: float) -> Array:
     """(6,) factors that convert scaled twists, mm at the radius, to rad and mm."""
     return np.array([1.0 / radius] * 3 + [1.0] * 3)
-
-
-def _orthonormal(rows: Array) -> Array:
-    """(K,6) orthonormal basis of the row space."""
-    _, values, vectors = np.linalg.svd(np.atleast_2d(rows), full_matrices=False)
-    return vectors[values > 1e-9 * max(values[0], 1e-300)]
-
-
-def _orthogonal_complement(basis: Array, part: Array) -> Array:
-    """(M,6) what of the space of ``basis`` is not in the space of ``part``; both orthonormal."""
-    values, vectors = np.linalg.eigh(basis @ (np.eye(6) - part.T @ part) @ basis.T)
-    return vectors[:, values > 0.5].T @ basis
-
-
-def _observable_directions(free: Array, undetermined: Array) -> Array:
-    """(K-M,6) orthonormal basis of the free directions (K,6) without the undetermined ones (M,6)."""
-    return _orthogonal_complement(free, undetermined) if len(undetermined) else free

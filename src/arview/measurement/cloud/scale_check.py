@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from arview.cad import Model
+from arview.core.least_squares import robust_sigma
 from arview.errors import InputError
 from arview.geometry import Array, exp_so3, rigid
 from arview.measurement.cloud.mesh_surface import MeshSurface
@@ -107,7 +108,7 @@ def _fit(points: Array, surface: MeshSurface, size: float) -> tuple[float, float
         rotation = turn @ pose[:3, :3]
         shift = grown * turn @ (shrink * pose[:3, 3] - center) + center + step[3:6]
         pose, shrink = rigid(rotation, shift / total), total
-        sigma = 1.4826 * float(np.median(np.abs(r)))
+        sigma = robust_sigma(r)
         width = max(0.5 * width, 4.7 * sigma, NOISE_MM)
     spread = float(np.sqrt(np.average(r**2, weights=weights)))
     return 1.0 / shrink, float(np.sqrt(inverse[6, 6])) * 10.0 * spread / size

@@ -14,21 +14,21 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from arview.core.least_squares import intersection, orthogonal_complement
 from arview.errors import InputError
 from arview.geometry import Array, exp_so3, rigid
 from arview.measurement.datums.datum_fit import DatumFit, check_fit_covered, fit_datum
 from arview.measurement.datums.directions import (
     direction_names,
-    intersection,
     observable_directions,
-    orthogonal_complement,
-    shared_directions,
     shift_origin,
 )
 from arview.measurement.datums.equations import DOF_NAMES, DatumEquations, point_from_move
 
 FORM_MM = 0.005
 """Standard uncertainty of a feature's position by its form: fine machining."""
+MEASURED_DEG = 1.15
+"""Directions of a datum that were measured, or follow from other axes, are right to within this angle."""
 
 
 @dataclass(frozen=True)
@@ -133,10 +133,10 @@ def align(
         if not is_base:
             check_fit_covered(one, fit)
         rows = one.rows - one.rows[:, 3:6] @ shift_origin(origin)
-        allowed = free if is_base else intersection(free, np.eye(6)[:, [name in one.locks for name in DOF_NAMES]])
+        allowed = free if is_base else intersection(free.T, np.eye(6)[[name in one.locks for name in DOF_NAMES]]).T
         trusted = np.ones(len(rows)) if one.feature == "fit" else fit.weights
         if one.directions is not None:
-            allowed = shared_directions(allowed, one.directions)
+            allowed = intersection(allowed.T, one.directions.T, MEASURED_DEG).T
         columns = observable_directions(rows[:, :6] * unit, allowed, trusted) * unit[:, None]
         if columns.shape[1] == 0:
             raise InputError(f"datum {one.label}: all that it could lock is already locked by the datums before it")
@@ -159,7 +159,7 @@ def align(
             move = move - change[:, -1] * before[6]
             gain = gain - np.outer(change[:, -1], before_gain[6])
             gain[:, 0] += change[:, -1]
-        free = orthogonal_complement(free, columns[:6] / unit[:, None])
+        free = orthogonal_complement((columns[:6] / unit[:, None]).T, free.T).T
         locked = direction_names(columns[:6] / unit[:, None])
         found.append((fit, locked))
         if is_base:

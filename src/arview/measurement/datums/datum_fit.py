@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from arview.core.least_squares import robust_sigma, tukey_weights
 from arview.geometry import Array
 from arview.measurement.datums.directions import shift_origin
 from arview.measurement.datums.equations import DatumEquations, DatumNotMeasuredError
@@ -17,9 +18,6 @@ MIN_SHARE = 0.3
 """Share of a datum that must be found; a rim seen on one side only is no circle."""
 MAX_STD_MM = 0.2
 """Largest standard deviation of any direction that a datum locks."""
-
-_TUKEY = 4.685
-"""Cut-off of Tukey's biweight in standard deviations: 95 % efficiency for normal errors."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +70,7 @@ def fit_datum(one: DatumEquations, is_exact: bool) -> DatumFit:
         weighted = local * weights[:, None]
         normal = np.linalg.pinv(weighted.T @ local, rcond=1e-12, hermitian=True)
         radius = float((normal @ (weighted.T @ one.offsets_mm))[-1])
-    sigma = float(1.4826 * np.median(np.abs(residuals[inliers]))) if inliers.any() else float("inf")
+    sigma = robust_sigma(residuals[inliers]) if inliers.any() else float("inf")
     return DatumFit(weights, one.variances * factor * correlation, sigma, correlation, radius, inliers)
 
 
@@ -100,11 +98,11 @@ def robust_weights(design: Array, values: Array, variances: Array) -> tuple[Arra
         normal = np.linalg.pinv(weighted.T @ design, rcond=1e-9, hermitian=True)
         residuals = values - design @ (normal @ (weighted.T @ values))
         noise = residuals * root
-        scale = max(1.4826 * float(np.median(np.abs(noise))), 1e-9)
+        scale = max(robust_sigma(noise), 1e-9)
         if step < 10:
             share = 1.0 / (1.0 + (noise / (2.385 * scale)) ** 2)
             continue
-        new = np.clip(1.0 - (noise / (_TUKEY * scale)) ** 2, 0.0, None) ** 2
+        new = tukey_weights(noise / scale)
         if np.abs(new - share).max() < 1e-4:
             break
         share = new

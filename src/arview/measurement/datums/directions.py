@@ -31,25 +31,6 @@ def observable_directions(rows: Array, allowed: Array, weights: Array) -> Array:
     return allowed @ right[values > MIN_SHARE_OF_SIZE * size].T
 
 
-def intersection(a: Array, b: Array) -> Array:
-    """Orthonormal basis of the intersection of two subspaces with orthonormal bases (6,K) and (6,L)."""
-    left, values, _ = np.linalg.svd(a.T @ b, full_matrices=False)
-    return a @ left[:, values > 1.0 - 1e-9]
-
-
-def shared_directions(a: Array, b: Array) -> Array:
-    """As `intersection`, to within a degree, for directions that were measured or follow from other axes."""
-    left, values, _ = np.linalg.svd(a.T @ b, full_matrices=False)
-    return a @ left[:, values > 0.9998]
-
-
-def orthogonal_complement(free: Array, columns: Array) -> Array:
-    """Orthonormal basis of the part of ``free`` (6,F) that is orthogonal to the orthonormal ``columns`` (6,K)."""
-    columns = columns[:, np.abs(columns).max(axis=0) > 0]
-    left, values, _ = np.linalg.svd(free - columns @ (columns.T @ free))
-    return left[:, : free.shape[1]][:, values[: free.shape[1]] > 0.5]
-
-
 def direction_names(directions: Array) -> str:
     """Directions as ``rx ry tz``; oblique ones as their number."""
     directions = directions[:, np.abs(directions).max(axis=0) > 0]

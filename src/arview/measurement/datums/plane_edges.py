@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from arview.cad import Datum
+from arview.core.least_squares import orthogonal_complement
 from arview.geometry import Array, exp_so3, log_so3, rigid
 from arview.measurement.datums.equations import DatumEquations, DatumNotMeasuredError, move_equations
 from arview.measurement.datums.options import REACH_MM
@@ -120,7 +121,7 @@ def _combined(moves: list[Move], directions: Array) -> Move:
         method="edges",
         twist=directions @ value,
         covariance=directions @ covariance @ directions.T,
-        undetermined=np.linalg.svd(directions.T)[2][directions.shape[1] :],
+        undetermined=orthogonal_complement(directions.T),
     )
 
 

@@ -17,8 +17,6 @@ from arview.camera import Camera
 from arview.core.kernel import kernel
 from arview.core.subpixel_edges import choose_steps, find_steps, linear_light
 from arview.geometry import Array, apply, invert, rigid
-from arview.guideviews import EDGE_CREASE, EDGE_SILHOUETTE, sample_visible_edges
-from arview.guideviews.mesh_edges import mesh_edges
 from arview.measurement.photo.component import MeasuredComponent
 from arview.measurement.photo.fit import RigidFit, fit_rigid, move_rows
 from arview.measurement.photo.options import JOINT_MM, UNDETERMINED_MM
@@ -26,6 +24,8 @@ from arview.measurement.photo.patches import near_others
 from arview.measurement.photo.rival_edges import EdgePoints, merged_shift_px, rival_offsets_px
 from arview.measurement.photo.views import PhotoViews
 from arview.measurement.types import Move, NotMeasured
+from arview.rendering import EDGE_CREASE, EDGE_SILHOUETTE, sample_visible_edges
+from arview.rendering.mesh_edges import mesh_edges
 
 CAPTURE_MM = 5.0
 """Largest displacement that the first round finds."""

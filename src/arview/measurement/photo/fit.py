@@ -8,10 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arview.core.kernel import kernel
+from arview.core.least_squares import orthogonal_complement, robust_sigma, tukey_weights
 from arview.geometry import Array
 
-TUKEY = 4.685
-"""Cut-off of Tukey's biweight in standard deviations: 95 % efficiency for normal errors."""
 _MAX_ITERATIONS = 20
 """Iterations of reweighting; most fits converge in less than ten."""
 _CORRELATION_EDGES = np.array([0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0])
@@ -82,7 +81,7 @@ def fit_rigid(
     scale = np.repeat([1.0 / radius_mm, 1.0], 3)
     scaled = rows * scale
     white = scaled / sigmas[:, None]
-    basis = _observable_directions(white, _orthogonal_complement(free), undetermined_mm)
+    basis = _observable_directions(white, orthogonal_complement(free).T, undetermined_mm)
     solution, residuals, weights = _reweighted(white, offsets / sigmas, basis, min_sigma)
     weighted = white @ basis * weights[:, None]
     inverse = np.linalg.pinv(weighted.T @ (white @ basis), hermitian=True)
@@ -102,15 +101,15 @@ def fit_rigid(
     # Directions whose covariance is too large, or whose support is too small, are undetermined as well.
     values, vectors = np.linalg.eigh(basis.T @ covariance @ basis)
     is_open = np.concatenate([(basis @ vectors[:, values > undetermined_mm**2]).T, modes[:, shares < min_support].T])
-    held = basis @ _orthogonal_complement(is_open @ basis)
+    held = basis @ orthogonal_complement(is_open @ basis).T
     project = held @ held.T
-    inliers_mm = np.abs(residuals[is_in] * sigmas[is_in])
+    inliers_mm = residuals[is_in] * sigmas[is_in]
     return RigidFit(
         twist=project @ solution * scale,
         covariance=project @ covariance @ project * np.outer(scale, scale),
-        undetermined=_orthogonal_complement(held.T).T,
+        undetermined=orthogonal_complement(held.T),
         weights=weights,
-        residual_mm=1.4826 * float(np.median(inliers_mm)) if is_in.any() else float("inf"),
+        residual_mm=robust_sigma(inliers_mm) if is_in.any() else float("inf"),
         gain=scale[:, None] * (project @ gain),
     )
 
@@ -136,8 +135,8 @@ def _reweighted(white: Array, target: Array, basis: Array, min_sigma: float) -> 
         normal = weighted.T @ (white @ basis)
         solution, last = basis @ np.linalg.pinv(normal, hermitian=True) @ (weighted.T @ target), solution
         residuals = target - white @ solution
-        spread = max(min_sigma, 1.4826 * float(np.median(np.abs(residuals))))
-        weights = np.clip(1.0 - (residuals / (TUKEY * spread)) ** 2, 0.0, None) ** 2
+        spread = max(min_sigma, robust_sigma(residuals))
+        weights = tukey_weights(residuals / spread)
         if np.abs(solution - last).max() < 1e-6:
             break
     return solution, residuals, weights
@@ -155,16 +154,6 @@ def _support(rows: Array, weights: Array, searched: Array, basis: Array) -> tupl
     shares, modes = eigh((inner * weights[:, None]).T @ inner, wanted)
     modes = basis @ modes
     return shares, modes / np.linalg.norm(modes, axis=0)
-
-
-def _orthogonal_complement(directions: Array) -> Array:
-    """Orthonormal columns (D,M) orthogonal to all rows of ``directions`` (K,D), which may be linearly dependent."""
-    size = directions.shape[1]
-    if not len(directions):
-        return np.eye(size)
-    _, values, vectors = np.linalg.svd(directions)
-    rank = int(np.count_nonzero(values > 1e-9))
-    return np.asarray(vectors[rank:].T)
 
 
 def _correlated(rows: Array, residuals: Array, places: Array, stride: int = 1) -> Array:

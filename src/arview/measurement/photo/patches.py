@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 
 from arview.cad import Component, Model, Part, Samples, Symmetry, find_symmetries, make_model
 from arview.core.kernel import kernel
+from arview.core.least_squares import row_space
 from arview.geometry import Array
-from arview.guideviews.mesh_edges import mesh_edges
 from arview.rendering import RayCaster
+from arview.rendering.mesh_edges import mesh_edges
 
 
 def tangents_of(normals: Array) -> tuple[Array, Array]:
@@ -116,10 +117,7 @@ def free_directions(component: Component, part: Part | None, center: Array, radi
             axis = np.array(symmetry.axis_in_model)
             shift = np.cross(axis, center - np.array(symmetry.through_in_model))
             moves.append(np.concatenate([axis * radius_mm, np.where(np.abs(shift) < 1e-3 * radius_mm, 0.0, shift)]))
-    if not moves:
-        return np.zeros((0, 6))
-    _, size, basis = np.linalg.svd(np.array(moves))
-    return np.asarray(basis[: np.count_nonzero(size > 1e-6 * radius_mm)])
+    return row_space(np.array(moves).reshape(-1, 6), 1e-6 * radius_mm)
 
 
 def symmetries_of(component: Component, part: Part | None) -> list[Symmetry]:

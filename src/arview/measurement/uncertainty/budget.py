@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from arview.core.least_squares import covariance_root
 from arview.errors import InputError
 from arview.geometry import Array, exp_so3
 from arview.measurement.datums.alignment import Alignment
@@ -280,9 +281,8 @@ def _draw(contributions: Sequence[Contribution], options: UncertaintyOptions, sa
     rng = np.random.default_rng([options.seed, salt])
     total = np.zeros((options.draws, len(normal)))
     for index, covariance in enumerate([normal, *bounded]):
-        values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
         noise = rng.standard_normal(total.shape) if index == 0 else rng.uniform(-_BOUND, _BOUND, total.shape)
-        total += noise @ (np.sqrt(np.maximum(values, 0.0)) * vectors).T
+        total += noise @ covariance_root(covariance).T
     return total
 
 

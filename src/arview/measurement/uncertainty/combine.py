@@ -8,6 +8,7 @@ from itertools import combinations
 
 import numpy as np
 
+from arview.core.least_squares import intersection, orthogonal_complement
 from arview.errors import InputError
 from arview.geometry import Array
 from arview.measurement.types import Method, Move, moved_to
@@ -45,6 +46,8 @@ class Agreement:
 
 UNDETERMINED_MM = 0.3
 """Largest standard deviation of a determined direction; rotations at the radius."""
+SAME_DEG = 3.03
+"""Directions that two methods determine are shared where they differ by less."""
 CONTRADICTION = 0.99
 """Share of differences that chance keeps below a contradiction."""
 
@@ -104,12 +107,12 @@ def combine(moves: Sequence[Move]) -> CombinedMove:
     unit = np.array([radius] * 3 + [1.0] * 3)
     scaled = np.outer(unit, unit)
     twists = [move.twist * unit for move in moves]
-    bases = [_orthogonal_complement(move.undetermined) for move in moves]
+    bases = [orthogonal_complement(move.undetermined) for move in moves]
     noise = [move.covariance * scaled for move in moves]
     weights = []
     for covariance, basis in zip(noise, bases, strict=True):
-        inside = basis.T @ covariance @ basis
-        weights.append(basis @ np.linalg.pinv(inside, rcond=1e-12, hermitian=True) @ basis.T)
+        inside = basis @ covariance @ basis.T
+        weights.append(basis.T @ np.linalg.pinv(inside, rcond=1e-12, hermitian=True) @ basis)
     values, vectors = np.linalg.eigh(np.sum(weights, axis=0))
     known = values > 1.0 / UNDETERMINED_MM**2
     inverse = (vectors[:, known] / values[known]) @ vectors[:, known].T
@@ -117,12 +120,13 @@ def combine(moves: Sequence[Move]) -> CombinedMove:
     twist = np.sum([gain @ one for gain, one in zip(gains, twists, strict=True)], axis=0)
     disagreement = np.zeros((6, 6))
     for i, j in combinations(range(len(moves)), 2):
+        common = intersection(bases[i], bases[j], SAME_DEG)
         for part in _PARTS:
-            axes = _intersection(_intersection(bases[i], bases[j]), np.eye(6)[:, part])
+            axes = intersection(common, np.eye(6)[part], SAME_DEG).T
             disagreement += _beyond_chance(
                 twists[i] - twists[j], noise[i] + noise[j], gains[i], gains[j], inverse, axes
             )
-        axes = _intersection(bases[i], bases[j])
+        axes = common.T
         squares = _squared_difference(axes.T @ (twists[i] - twists[j]), axes.T @ (noise[i] + noise[j]) @ axes)
         if squares > chi2_quantile(axes.shape[1], CONTRADICTION):
             disagreement += axes @ _between(axes.T @ twists[i], axes.T @ twists[j], axes.T @ twist) @ axes.T
@@ -181,7 +185,8 @@ def agreements(moves: Sequence[Move]) -> tuple[Agreement, ...]:
     found = []
     for a, b in combinations(moves, 2):
         unit = np.array([a.radius_mm] * 3 + [1.0] * 3)
-        shared = _intersection(_orthogonal_complement(a.undetermined), _orthogonal_complement(b.undetermined))
+        known = [orthogonal_complement(move.undetermined) for move in (a, b)]
+        shared = intersection(known[0], known[1], SAME_DEG).T
         apart = shared.T @ ((a.twist - b.twist) * unit)
         joint = shared.T @ ((a.covariance + b.covariance) * np.outer(unit, unit)) @ shared
         squares, freedom = _squared_difference(apart, joint), shared.shape[1]
@@ -209,18 +214,3 @@ def quantile_of_length(covariance: Array, probability: float = 0.95) -> float:
     if trace <= 0 or square <= 0:
         return 0.0
     return float(np.sqrt(2.0 * square / trace * gammaincinv(0.5 * trace**2 / square, probability)))
-
-
-def _orthogonal_complement(undetermined: Array) -> Array:
-    """(6,6-K) orthonormal columns orthogonal to the rows (K,6)."""
-    if len(undetermined) == 0:
-        return np.eye(6)
-    return np.linalg.svd(undetermined)[2][len(undetermined) :].T
-
-
-def _intersection(a: Array, b: Array) -> Array:
-    """Orthonormal basis of the intersection of two subspaces (6,K), (6,L), to within 3°."""
-    if a.shape[1] == 0 or b.shape[1] == 0:
-        return np.zeros((6, 0))
-    left, values, _ = np.linalg.svd(a.T @ b, full_matrices=False)
-    return a @ left[:, values > 0.9986]

@@ -8,6 +8,7 @@ import numpy as np
 
 from arview import measurement
 from arview.cad import Model, Part
+from arview.core.least_squares import row_space
 from arview.geometry import Array, apply, log_so3
 from arview.inspection import MEASURANDS, ComponentDeviation
 from arview.quality.rework.words import up_of
@@ -139,8 +140,4 @@ def correction_of(one: ComponentDeviation, standing: Standing) -> Correction:
 
 def _span(rows: Array) -> Array:
     """(N,3) orthonormal directions that rows (K,3) span; short rows are noise."""
-    rows = rows[np.linalg.norm(rows, axis=1) > 0.05]
-    if not len(rows):
-        return np.zeros((0, 3))
-    _, sizes, basis = np.linalg.svd(rows)
-    return np.asarray(basis[: int(np.count_nonzero(sizes > 0.05))])
+    return row_space(rows[np.linalg.norm(rows, axis=1) > 0.05], 0.05)

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from arview.cad import Component, make_model
 from arview.geometry import Array
-from arview.guideviews.mesh_edges import mesh_edges
 from arview.rendering import rasterise
+from arview.rendering.mesh_edges import mesh_edges
 
 Window = tuple[float, float, float, float]
 """Left, lower, right and upper edge in the drawing plane, mm."""

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arview.cad import Part
+from arview.core.least_squares import nearest_covariance
 from arview.core.progress import Progress
-from arview.geometry import Array
 from arview.reconstruction.scale.cad import CadFind, CadOptions, NotFound, Pixels, find_cad
 from arview.reconstruction.scale.consistency import check_consistency
 from arview.reconstruction.scale.specs import ScaleSources
@@ -113,7 +113,7 @@ def find_scale(
         combined.scale,
         combined.std,
         similarity.model_from_scan,
-        covariance=_positive(covariance),
+        covariance=nearest_covariance(covariance),
         evidence=combined.evidence,
         warnings=tuple(warnings),
         why_no_frame="",
@@ -152,12 +152,6 @@ def combine(evidence: Sequence[ScaleEvidence]) -> CombinedScale | None:
     excess = float(weights @ (logs - mean) ** 2) / max(1, len(used) - 1)
     std = float(np.sqrt(max(1.0, excess) / weights.sum()))
     return CombinedScale(float(np.exp(mean)), std, tuple(checked), tuple(warnings))
-
-
-def _positive(covariance: Array) -> Array:
-    """The nearest covariance without negative variances."""
-    values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
-    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
 
 
 def _read_file(photo: PosedPhoto) -> NDArray[np.uint8]:

@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 
 from arview.cad import Model
 from arview.camera import Camera
+from arview.core.least_squares import robust_sigma, tukey_weights
 from arview.core.parallel import pool
 from arview.core.subpixel_edges import choose_steps, find_steps
 from arview.geometry import Array, apply
-from arview.guideviews import EDGE_SHARP, EDGE_SILHOUETTE, sample_visible_edges
-from arview.guideviews.mesh_edges import mesh_edges
 from arview.reconstruction.scale.similarity import Similarity
-from arview.rendering import ZBufferRenderer
+from arview.rendering import EDGE_SHARP, EDGE_SILHOUETTE, ZBufferRenderer, sample_visible_edges
+from arview.rendering.mesh_edges import mesh_edges
 
 
 @dataclass(frozen=True)
@@ -362,8 +362,8 @@ class _JointSystem:
         self.is_base = is_base
         # Residuals with each component at the place that the previous round found.
         left = self.offsets - np.sum(self.rows[:, 3:6] * displacements[self.component], axis=1)
-        self.sigma_px = max(MIN_SIGMA_PX, 1.4826 * float(np.median(np.abs(left))) if len(left) else np.inf)
-        self.weights = np.clip(1.0 - (left / (4.685 * self.sigma_px)) ** 2, 0.0, None) ** 2 / self.sigma_px**2
+        self.sigma_px = max(MIN_SIGMA_PX, robust_sigma(left) if len(left) else np.inf)
+        self.weights = tukey_weights(left / self.sigma_px) / self.sigma_px**2
         moving = np.linalg.norm(displacements[~is_base], axis=1)
         width_mm = max(MIN_DISPLACEMENT_MM, 0.6 * float(np.median(moving)) if len(moving) else 0.0)
         # Student's t with one degree of freedom in three dimensions.

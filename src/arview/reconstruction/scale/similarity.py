@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from arview.core.least_squares import fit_similarity
 from arview.errors import InputError
 from arview.geometry import Array, apply, exp_se3, invert, orthonormalise, rigid
 
@@ -57,8 +58,7 @@ class PointFit:
 def fit_points(points_in_scan: Array, points_in_mm: Array, scale: float | None = None) -> PointFit:
     """Least-squares similarity from points (N,3) of the reconstruction to the same points in mm.
 
-    Umeyama, "Least-squares estimation of transformation parameters between two point patterns" (PAMI 1991); the
-    uncertainty of the scale follows from the residuals. With ``scale`` given, only the rigid motion is fitted.
+    The uncertainty of the scale follows from the residuals. With ``scale`` given, only the rigid motion is fitted.
 
     Raises:
         InputError: there are fewer than three points, or all coincide.
@@ -66,18 +66,11 @@ def fit_points(points_in_scan: Array, points_in_mm: Array, scale: float | None =
     source, target = np.asarray(points_in_scan, np.float64), np.asarray(points_in_mm, np.float64)
     if len(source) < 3 or source.shape != target.shape:
         raise InputError(f"similarity: {len(source)} and {len(target)} points; expected at least three pairs")
-    a, b = source - source.mean(axis=0), target - target.mean(axis=0)
-    spread = float(np.sum(a * a))
-    if not spread > 0 or not np.sum(b * b) > 0:
+    size = float(np.sum((target - target.mean(axis=0)) ** 2))
+    if not np.ptp(source, axis=0).any() or not size > 0:
         raise InputError("similarity: all points are at the same place")
-    u, singular, vt = np.linalg.svd(b.T @ a)
-    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
-    rotation = (u * sign) @ vt
-    if scale is None:
-        scale = float(np.sum(singular * sign) / spread)
-    left = b - scale * a @ rotation.T
-    freedom = max(1, 3 * len(a) - 7)
-    variance = float(np.sum(left * left)) / freedom
-    std = float(np.sqrt(variance / np.sum(b * b)))
-    similarity = Similarity(scale, rigid(rotation, target.mean(axis=0) - scale * rotation @ source.mean(axis=0)))
+    similarity = Similarity(*fit_similarity(source, target, scale))
+    left = target - similarity.points_in_model(source)
+    variance = float(np.sum(left * left)) / max(1, 3 * len(source) - 7)
+    std = float(np.sqrt(variance / size))
     return PointFit(similarity, std, float(np.sqrt(np.mean(np.sum(left * left, axis=1)))))

@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from arview.core.least_squares import robust_sigma
 from arview.core.parallel import pool
 from arview.fiducials import Board, CornerKey, Tags, cv_board, find_corners
 from arview.geometry import Array
@@ -151,7 +152,7 @@ def _tag_evidence(
     logs = np.log([fit.similarity.scale for fit in fits])
     middle = float(np.median(logs))
     from_residuals = float(np.median([fit.scale_std for fit in fits]))
-    scatter = max(1.4826 * float(np.median(np.abs(logs - middle))), from_residuals)
+    scatter = max(robust_sigma(logs - middle), from_residuals)
     from_tone_curve = 2.0 * TAG_EDGE_STD_PX / side_px
     std = float(np.linalg.norm([1.2533 * scatter / np.sqrt(len(fits)), from_tone_curve, PRINT_STD]))
     rms_mm = float(np.sqrt(np.mean([fit.rms_mm**2 for fit in fits])))

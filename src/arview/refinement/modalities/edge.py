@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from arview.core.kernel import kernel
 from arview.geometry import Array
-from arview.guideviews import EDGE_CONTOUR, EDGE_SHARP, EDGE_SILHOUETTE
 from arview.refinement.gauss_newton import add_line
 from arview.refinement.modalities.region import ColorModel
 from arview.refinement.projection import ProjectedLines, project
+from arview.rendering import EDGE_CONTOUR, EDGE_SHARP, EDGE_SILHOUETTE
 
 INNER_SILHOUETTE_WEIGHT, FOLD_WEIGHT = 0.1, 0.02
 """Weights of a round rim in front of the part itself, and of a fold of a curved surface, relative to outline and design

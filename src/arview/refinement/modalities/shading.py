@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from arview.cad import edge_faces
 from arview.camera import Camera
 from arview.core.kernel import kernel
 from arview.geometry import Array
@@ -103,12 +104,8 @@ def curved_share(surface: Surface, flat_deg: float = 0.5) -> float:
     """Share of a surface's area in faces that meet a neighbour at an angle that is neither flat nor an edge."""
     points, faces, normals = (np.asarray(part, dtype=np.float64) for part in surface[:3])
     corners = faces.astype(np.int64)
-    edges = np.sort(np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]]), axis=1)
-    owners = np.tile(np.arange(len(corners)), 3)
-    order = np.lexsort((edges[:, 1], edges[:, 0]))
-    edges, owners = edges[order], owners[order]
-    joined = np.flatnonzero(np.all(edges[1:] == edges[:-1], axis=1))
-    one, other = owners[joined], owners[joined + 1]
+    edges = edge_faces(corners)
+    one, other = edges.faces[edges.face_count > 1].T
     cosine = np.abs(np.sum(normals[one] * normals[other], axis=1))
     is_curved = (cosine < np.cos(np.deg2rad(flat_deg))) & (cosine > np.cos(np.deg2rad(CREASE_DEG)))
     curved = np.unique(np.concatenate([one[is_curved], other[is_curved]]))

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from arview.cad import Model
 from arview.geometry import Array
-from arview.guideviews.mesh_edges import mesh_edges
+from arview.rendering.mesh_edges import mesh_edges
 
 COARSE_FACES = 150_000
 """Faces of the coarser mesh, at most about; a page draws as many while it is dragged."""

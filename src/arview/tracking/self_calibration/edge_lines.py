@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from arview.core.kernel import kernel
 from arview.geometry import Array
-from arview.guideviews import EDGE_SHARP
 from arview.refinement import CUT_OFF, HYPOTHESES, EdgeProfiles, ProjectedLines, project
+from arview.rendering import EDGE_SHARP
 
 POSE_COLUMNS, SHARED_COLUMNS = 6, 4
 """Unknowns of a pose, and of the camera: logarithm of the focal length, principal point (2), radial distortion k1."""

@@ -11,8 +11,9 @@ from typing import Any, Literal
 
 import numpy as np
 
+from arview.core.least_squares import fit_similarity
 from arview.errors import InputError
-from arview.geometry import Array, apply, rigid
+from arview.geometry import Array, apply
 from arview.measurement.cloud.registration import move_about
 
 Method = Literal["point", "plane", "generalized"]
@@ -122,7 +123,7 @@ def register_clouds(
             raise InputError(f"registration: {len(pairs)} of {len(source)} points have a partner within {limit:g} mm")
         x, y, n = moved[pairs], target.points[index[pairs]], target.normals[index[pairs]]
         if o.method == "point":
-            step = _best_rigid(x, y)
+            step = fit_similarity(x, y, 1.0)[1]
         elif o.method == "plane":
             rows = np.hstack([np.cross(x - center, n), n])
             step = _step(rows.T @ rows, rows.T @ np.sum(n * (x - y), axis=1), center)
@@ -137,14 +138,6 @@ def register_clouds(
         limit = max(o.last_distance_mm, 0.5 * limit)
     rms = float(np.sqrt(np.mean(distance[pairs] ** 2)))
     return IcpResult(pose, rms, len(pairs) / len(source), iterations, converged)
-
-
-def _best_rigid(x: Array, y: Array) -> Array:
-    """(4,4) least-squares rigid motion of points x to their partners y (Arun, Huang & Blostein 1987)."""
-    middle_x, middle_y = x.mean(axis=0), y.mean(axis=0)
-    u, _, vt = np.linalg.svd((x - middle_x).T @ (y - middle_y))
-    rotation = vt.T @ np.diag([1.0, 1.0, np.linalg.det(vt.T @ u.T)]) @ u.T
-    return rigid(rotation, middle_y - rotation @ middle_x)
 
 
 def _step(hessian: Array, gradient: Array, center: Array) -> Array:

@@ -10,9 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from arview.core import least_squares
+from arview.core.least_squares import robust_sigma, tukey_weights
 from arview.errors import InputError
 from arview.geometry import Array
-from arview.measurement.cloud.registration import TUKEY_SIGMAS
 
 _ITERATIONS = 60
 
@@ -137,7 +138,7 @@ def fit_cylinder(
         return distance - x[4], rows
 
     known = radius_mm if radius_mm is not None else np.nan
-    center, radius = _circle_start(local[:, :2])
+    center, radius = least_squares.fit_circle(local[:, :2])
     start = np.array([*center, 0.0, 0.0, radius if radius_mm is None else known])
     x, weights, rest = _solve(residuals, start, 5 if radius_mm is None else 4, is_robust)
     axis = np.array([x[2], x[3], 1.0]) @ frame
@@ -162,7 +163,7 @@ def fit_circle(points: Array, normal: Array | None = None, is_robust: bool = Tru
         distance = np.maximum(np.linalg.norm(away, axis=1), 1e-9)
         return distance - x[2], np.column_stack([-away / distance[:, None], -np.ones(len(local))])
 
-    center, radius = _circle_start(local)
+    center, radius = least_squares.fit_circle(local)
     x, weights, rest = _solve(residuals, np.array([*center, radius]), 3, is_robust)
     return Circle(plane.point + np.array([x[0], x[1], 0.0]) @ frame, frame[2], float(x[2]), *_quality(rest, weights))
 
@@ -187,21 +188,13 @@ def _solve(
 
 def _weights(residuals: Array) -> Array:
     """Tukey's weights for the scale of the median residual."""
-    limit = TUKEY_SIGMAS * max(1.4826 * float(np.median(np.abs(residuals))), 1e-9)
-    return np.where(np.abs(residuals) < limit, (1.0 - np.minimum(np.abs(residuals) / limit, 1.0) ** 2) ** 2, 0.0)
+    return tukey_weights(residuals / max(robust_sigma(residuals), 1e-9))
 
 
 def _quality(residuals: Array, weights: Array) -> tuple[float, int]:
     """Rms residual and number of the points with a weight above 0.1."""
     used = weights > 0.1
     return float(np.sqrt(np.mean(residuals[used] ** 2))), int(np.count_nonzero(used))
-
-
-def _circle_start(local: Array) -> tuple[Array, float]:
-    """Centre and radius by algebraic least squares (Kåsa 1976)."""
-    rows = np.column_stack([2.0 * local, np.ones(len(local))])
-    a, b, c = np.linalg.lstsq(rows, np.sum(local**2, axis=1), rcond=None)[0]
-    return np.array([a, b]), float(np.sqrt(max(c + a * a + b * b, 1e-12)))
 
 
 def _frame(direction: Array) -> Array:

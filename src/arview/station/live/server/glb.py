@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from arview.cad import Model
-from arview.guideviews.mesh_edges import mesh_edges
+from arview.rendering.mesh_edges import mesh_edges
 
 
 def model_glb(model: Model) -> bytes:

@@ -7,12 +7,12 @@ camera and the other does not (Appel 1967; Gooch et al. 1999). Hidden samples ar
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.cad import Model
+from arview.cad import Model, edge_faces
 from arview.core.kernel import kernel
 from arview.geometry import Array
 
@@ -26,11 +26,12 @@ EDGE_SHARP = 8
 """Kind bit: a crease too sharp to be between two facets of a curved surface: an edge of the design."""
 SHARP_ANGLE_DEG = 50.0
 """Dihedral angle above which a crease is sharp."""
+INITIAL_SAMPLES = 4096
+"""Samples for which memory is reserved at first; it doubles when it is full."""
 
 
-@dataclass(frozen=True)
-class MeshEdges:
-    """The unique edges of a model; touching components keep edges of their own.
+class MeshEdges(NamedTuple):
+    """The unique edges of a model; touching components keep edges of their own. Kernels take it as it is.
 
     Attributes:
         vertices_in_model: (V,3) mm.
@@ -75,26 +76,17 @@ def mesh_edges(model: Model, crease_angle_deg: float = 30.0) -> MeshEdges:
         component_of_face[keep],
     )
 
-    half = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    face_of_half = np.tile(np.arange(len(faces)), 3)
-    half_sorted = np.sort(half, axis=1)
-    order = np.lexsort((half_sorted[:, 1], half_sorted[:, 0]))
-    half_sorted, face_of_half = half_sorted[order], face_of_half[order]
-    start = np.flatnonzero(np.r_[True, np.any(half_sorted[1:] != half_sorted[:-1], axis=1)])
-    count = np.diff(np.r_[start, len(half_sorted)])
-    ends = half_sorted[start]
-    face_a = face_of_half[start]
-    face_b = np.where(count >= 2, face_of_half[np.minimum(start + 1, len(face_of_half) - 1)], -1)
-    cosine = np.einsum("ij,ij->i", normals[face_a], normals[np.maximum(face_b, 0)])
-    is_crease = (count != 2) | (cosine < np.cos(np.deg2rad(crease_angle_deg)))
+    edges = edge_faces(faces)
+    cosine = np.einsum("ij,ij->i", normals[edges.faces[:, 0]], normals[edges.faces[:, 1]])
+    is_border = edges.face_count != 2
     return MeshEdges(
         vertices_in_model=vertices,
-        ends=np.ascontiguousarray(ends, dtype=np.int32),
-        faces=np.ascontiguousarray(np.stack([face_a, face_b], axis=1), dtype=np.int32),
-        is_crease=is_crease,
-        is_sharp=(count != 2) | (cosine < np.cos(np.deg2rad(SHARP_ANGLE_DEG))),
+        ends=np.ascontiguousarray(edges.ends, dtype=np.int32),
+        faces=np.ascontiguousarray(edges.faces, dtype=np.int32),
+        is_crease=is_border | (cosine < np.cos(np.deg2rad(crease_angle_deg))),
+        is_sharp=is_border | (cosine < np.cos(np.deg2rad(SHARP_ANGLE_DEG))),
         face_normals=np.ascontiguousarray(normals),
-        component=component_of_face[face_a].astype(np.int32),
+        component=component_of_face[edges.faces[:, 0]].astype(np.int32),
     )
 
 
@@ -133,63 +125,91 @@ def _to_cam(
     return x, y, z
 
 
-@kernel
-def _depth_test(depth: NDArray[np.float32], column: int, row: int, z: float, tolerance: float) -> tuple[bool, bool]:
-    """Compare a depth with the 3×3 pixels around a place: is any of them as deep, is any of them background?"""
-    is_visible = False
-    is_contour = False
-    for dy in range(-1, 2):
-        for dx in range(-1, 2):
-            d = depth[row + dy, column + dx]
-            if d <= 0:
-                is_contour = True
-            elif z - d < tolerance and d - z < tolerance:
-                is_visible = True
-    return is_visible, is_contour
+class EdgeSamples(NamedTuple):
+    """Samples along edges inside of a picture, whether hidden or not.
+
+    Attributes:
+        points_in_model: (N,3) mm, exactly on the mesh edges.
+        tangents_in_model: (N,3) unit vectors along the edge.
+        pixels: (N,2) their projections.
+        along_px: (N,2) from start to end of the whole edge in the picture.
+        depths_mm: (N,) in the camera frame.
+        edges: (N,) index of the edge.
+        kinds: (N,) uint8, EDGE_CREASE and EDGE_SILHOUETTE.
+    """
+
+    points_in_model: NDArray[np.float64]
+    tangents_in_model: NDArray[np.float64]
+    pixels: NDArray[np.float64]
+    along_px: NDArray[np.float64]
+    depths_mm: NDArray[np.float64]
+    edges: NDArray[np.int32]
+    kinds: NDArray[np.uint8]
 
 
 @kernel
-def _sample_visible(
-    vertices: NDArray[np.float64], ends: NDArray[np.int32], faces: NDArray[np.int32], is_crease: NDArray[np.bool_],
-    is_sharp: NDArray[np.bool_], normals: NDArray[np.float64], component: NDArray[np.int32],
-    cam_from_model: NDArray[np.float64], fx: float, fy: float, cx: float, cy: float, depth: NDArray[np.float32],
-    spacing_px: float, depth_tolerance: float
-) -> tuple[NDArray[Any], ...]:  # fmt: skip
-    """The kernel of `sample_visible_edges`; returns the arrays of `ViewEdgeSamples` in their order."""
-    height, width = depth.shape
-    rotation = cam_from_model[:3, :3]
-    translation = cam_from_model[:3, 3]
+def _longer(array: NDArray[Any]) -> NDArray[Any]:
+    """A copy of twice the length."""
+    return np.concatenate((array, np.empty_like(array)))
+
+
+@kernel
+def sample_edges(
+    edges: MeshEdges,
+    is_crease: NDArray[np.bool_],
+    cam_from_model: NDArray[np.float64],
+    intrinsics: NDArray[np.float64],
+    width: int,
+    height: int,
+    spacing_px: float,
+    min_depth_mm: float,
+    min_foreshortening: float,
+) -> EdgeSamples:
+    """Samples along the silhouettes, and the creases with a face turned to the camera, of a mesh.
+
+    Args:
+        edges: of the mesh.
+        is_crease: (E,) edges that are sampled although they are no silhouettes.
+        cam_from_model: (4,4) pose.
+        intrinsics: (4,) fx, fy, cx, cy in px of an ideal camera.
+        width, height: of the picture, px; samples on its outermost pixels are left out.
+        spacing_px: mean distance between samples along an edge, in the picture.
+        min_depth_mm: edges that begin or end nearer to the camera's plane are left out.
+        min_foreshortening: edges whose image is shorter than this share of their length seen frontally are left out.
+    """
+    fx, fy, cx, cy = intrinsics
+    rotation, translation = cam_from_model[:3, :3], cam_from_model[:3, 3]
     eye = np.empty(3)
     for k in range(3):
         eye[k] = -(rotation[0, k] * translation[0] + rotation[1, k] * translation[1] + rotation[2, k] * translation[2])
-    capacity = 4096
-    points = np.empty((capacity, 3))
-    pixels = np.empty((capacity, 2))
-    tangents = np.empty((capacity, 3))
-    lengths = np.empty(capacity)
+    capacity = INITIAL_SAMPLES
+    points, tangents = np.empty((capacity, 3)), np.empty((capacity, 3))
+    pixels, along = np.empty((capacity, 2)), np.empty((capacity, 2))
+    depths, owners = np.empty(capacity), np.empty(capacity, dtype=np.int32)
     kinds = np.empty(capacity, dtype=np.uint8)
-    owners = np.empty(capacity, dtype=np.int32)
     found = 0
     carry = 0.5
-    for e in range(ends.shape[0]):
-        a = vertices[ends[e, 0]]
-        b = vertices[ends[e, 1]]
-        f0, f1 = faces[e, 0], faces[e, 1]
-        front0, front1 = facing(eye, a, normals, f0, f1)
-        silhouette = f1 < 0 or (front0 > 0) != (front1 > 0)
+    for e in range(edges.ends.shape[0]):
+        a, b = edges.vertices_in_model[edges.ends[e, 0]], edges.vertices_in_model[edges.ends[e, 1]]
+        front0, front1 = facing(eye, a, edges.face_normals, edges.faces[e, 0], edges.faces[e, 1])
+        silhouette = edges.faces[e, 1] < 0 or (front0 > 0) != (front1 > 0)
         crease = is_crease[e] and (front0 > 0 or front1 > 0)
         if not (silhouette or crease):
             continue
         ax, ay, az = _to_cam(rotation, translation, a)
         bx, by, bz = _to_cam(rotation, translation, b)
-        if min(az, bz) < min(1.0, depth_tolerance):
+        if min(az, bz) < min_depth_mm:
             continue
         du = fx * (bx / bz - ax / az)
         dv = fy * (by / bz - ay / az)
         length = np.sqrt(du * du + dv * dv)
-        count_real = length / spacing_px + carry
-        count = int(count_real)
-        carry = count_real - count
+        size = np.sqrt((b[0] - a[0]) ** 2 + (b[1] - a[1]) ** 2 + (b[2] - a[2]) ** 2)
+        if length < min_foreshortening * fx * size / az:
+            continue
+        # The remainder is carried to the next edge, so that short edges get their share of samples.
+        wanted = length / spacing_px + carry
+        count = int(wanted)
+        carry = wanted - count
         for i in range(count):
             t = (i + 0.5) / count
             z = az + t * (bz - az)
@@ -198,37 +218,39 @@ def _sample_visible(
             iu, iv = int(np.round(u)), int(np.round(v))
             if iu < 1 or iv < 1 or iu >= width - 1 or iv >= height - 1:
                 continue
-            is_visible, is_contour = _depth_test(depth, iu, iv, z, depth_tolerance)
-            if not is_visible:
-                continue
             if found == capacity:
                 capacity *= 2
-                points = np.concatenate((points, np.empty_like(points)))
-                pixels = np.concatenate((pixels, np.empty_like(pixels)))
-                tangents = np.concatenate((tangents, np.empty_like(tangents)))
-                lengths = np.concatenate((lengths, np.empty_like(lengths)))
-                kinds = np.concatenate((kinds, np.empty_like(kinds)))
-                owners = np.concatenate((owners, np.empty_like(owners)))
-            norm = 0.0
+                points, tangents, pixels, along = _longer(points), _longer(tangents), _longer(pixels), _longer(along)
+                depths, owners, kinds = _longer(depths), _longer(owners), _longer(kinds)
             for k in range(3):
                 points[found, k] = a[k] + t * (b[k] - a[k])
-                tangents[found, k] = b[k] - a[k]
-                norm += tangents[found, k] ** 2
-            norm = np.sqrt(norm)
-            for k in range(3):
-                tangents[found, k] /= norm
-            pixels[found, 0] = u
-            pixels[found, 1] = v
-            lengths[found] = length
-            kinds[found] = (
-                (EDGE_CONTOUR if is_contour else 0)
-                + (EDGE_CREASE if crease else 0)
-                + (EDGE_SILHOUETTE if silhouette else 0)
-                + (EDGE_SHARP if crease and is_sharp[e] else 0)
-            )
-            owners[found] = component[e]
+                tangents[found, k] = (b[k] - a[k]) / size
+            pixels[found, 0], pixels[found, 1] = u, v
+            along[found, 0], along[found, 1] = du, dv
+            depths[found], owners[found] = z, e
+            kinds[found] = (EDGE_CREASE if crease else 0) + (EDGE_SILHOUETTE if silhouette else 0)
             found += 1
-    return points[:found], pixels[:found], tangents[:found], lengths[:found], kinds[:found], owners[:found]
+    return EdgeSamples(
+        points[:found], tangents[:found], pixels[:found], along[:found], depths[:found], owners[:found], kinds[:found]
+    )
+
+
+@kernel
+def _depth_tests(
+    samples: EdgeSamples, depth_mm: NDArray[np.float32], tolerance_mm: float
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Compare samples with the 3×3 pixels around each: is any of them as deep (N,), is any of them background (N,)?"""
+    is_visible = np.zeros(len(samples.depths_mm), dtype=np.bool_)
+    is_contour = np.zeros(len(samples.depths_mm), dtype=np.bool_)
+    for i in range(len(samples.depths_mm)):
+        column, row = int(np.round(samples.pixels[i, 0])), int(np.round(samples.pixels[i, 1]))
+        for y in range(row - 1, row + 2):
+            for x in range(column - 1, column + 2):
+                if depth_mm[y, x] <= 0:
+                    is_contour[i] = True
+                elif abs(samples.depths_mm[i] - depth_mm[y, x]) < tolerance_mm:
+                    is_visible[i] = True
+    return is_visible, is_contour
 
 
 @dataclass(frozen=True)
@@ -268,26 +290,29 @@ def sample_visible_edges(
         depth_mm: (H,W) depth of the model in this view, 0 for background.
         spacing_px: mean distance between samples along an edge, in the picture.
     """
-    fx, fy, cx, cy = intrinsics
     seen = depth_mm[depth_mm > 0]
     # Two pixels' worth of a surface seen at 45 degrees.
-    tolerance = 3.0 * float(np.median(seen)) / fx if seen.size else 1.0
+    tolerance_mm = 3.0 * float(np.median(seen)) / intrinsics[0] if seen.size else 1.0
+    height, width = depth_mm.shape
+    samples = sample_edges(
+        edges,
+        edges.is_crease,
+        cam_from_model,
+        intrinsics=np.array(intrinsics, dtype=np.float64),
+        width=width,
+        height=height,
+        spacing_px=spacing_px,
+        min_depth_mm=min(1.0, tolerance_mm),
+        min_foreshortening=0.0,
+    )
+    is_visible, is_contour = _depth_tests(samples, depth_mm, tolerance_mm)
+    shown = EdgeSamples._make(values[is_visible] for values in samples)
+    is_sharp = (shown.kinds & EDGE_CREASE > 0) & edges.is_sharp[shown.edges]
     return ViewEdgeSamples(
-        *_sample_visible(
-            edges.vertices_in_model,
-            edges.ends,
-            edges.faces,
-            is_crease=edges.is_crease,
-            is_sharp=edges.is_sharp,
-            normals=edges.face_normals,
-            component=edges.component,
-            cam_from_model=cam_from_model,
-            fx=fx,
-            fy=fy,
-            cx=cx,
-            cy=cy,
-            depth=depth_mm,
-            spacing_px=spacing_px,
-            depth_tolerance=tolerance,
-        )
+        shown.points_in_model,
+        shown.pixels,
+        shown.tangents_in_model,
+        lengths_px=np.hypot(shown.along_px[:, 0], shown.along_px[:, 1]),
+        kinds=shown.kinds | np.uint8(EDGE_CONTOUR) * is_contour[is_visible] | np.uint8(EDGE_SHARP) * is_sharp,
+        component=edges.component[shown.edges],
     )
