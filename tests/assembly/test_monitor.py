@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from arview.assembly.monitor import OPEN_FRAMES, SUSPECT_FRAMES, AssemblyMonitor
+from arview.assembly.monitor import AssemblyMonitor
 from arview.assembly.observation import Observation
+from arview.assembly.observation_schedule import OPEN_FRAMES, SUSPECT_FRAMES
 from arview.cad.model import Model
 from arview.geometry import Array, apply
 from arview.tracking import SpecimenTracking
@@ -166,7 +167,7 @@ def test_a_displaced_component_stays_mismatched_when_seen_along_its_displacement
         seen.reset()
         for k, ratio in enumerate(ratios):
             against = np.where(np.arange(count) == 2, ratio, 0.0)
-            monkeypatch.setattr(seen, "observe", lambda *_: said(against))  # noqa: B023
+            monkeypatch.setattr(seen.observer, "observe", lambda *_: said(against))  # noqa: B023
             for _ in range(SUSPECT_FRAMES):
                 seen.update(np.zeros((480, 640, 3), np.uint8), pose_from(-70 + 10 * k, 45, 520))
         return seen.mismatches
@@ -187,7 +188,7 @@ def test_evidence_of_blurred_pictures_is_soon_outweighed_from_the_same_direction
     def observe(*_: object) -> Observation:
         return said(np.where(np.arange(count) == 2, next(ratios), -3.0))
 
-    monkeypatch.setattr(seen, "observe", observe)
+    monkeypatch.setattr(seen.observer, "observe", observe)
     blank, pose = np.zeros((480, 640, 3), np.uint8), pose_from(0, 45, 520)
     for _ in range(2):
         seen.update(blank, pose)
@@ -204,7 +205,7 @@ def test_one_frame_alone_reports_no_mismatch(
     seen = AssemblyMonitor(assembly_views(), CAMERA, assembly())
     count = len(assembly().components)
     against = iter([np.where(np.arange(count) == 2, ratio, -3.0) for ratio in (3.0, second)])
-    monkeypatch.setattr(seen, "observe", lambda *_: said(next(against)))
+    monkeypatch.setattr(seen.observer, "observe", lambda *_: said(next(against)))
     blank, pose = np.zeros((480, 640, 3), np.uint8), pose_from(0, 45, 520)
     seen.update(blank, pose)
     assert seen.mismatches == () and len(seen.uncertain) == 1
@@ -221,7 +222,7 @@ def test_a_component_entering_the_view_is_observed_soon(
     others = np.arange(count) != 2
     observation = said(np.where(others, -3.0, 0.0), others | was_visible)
     observed = []
-    monkeypatch.setattr(seen, "observe", lambda *_: observed.append(1) or observation)
+    monkeypatch.setattr(seen.observer, "observe", lambda *_: observed.append(1) or observation)
     for _ in range(2):
         seen.update(np.zeros((480, 640, 3), np.uint8), pose_from(-40, 45, 520))
     waited = 0
@@ -271,8 +272,8 @@ def test_a_component_is_unverified_until_it_is_confirmed_at_its_place(is_there: 
 def test_a_verified_part_is_observed_now_and_then(monkeypatch: pytest.MonkeyPatch) -> None:
     observed = []
     seen = AssemblyMonitor(assembly_views(), CAMERA, assembly())
-    observe = seen.observe
-    monkeypatch.setattr(seen, "observe", lambda *of: observed.append(1) or observe(*of))
+    observe = seen.observer.observe
+    monkeypatch.setattr(seen.observer, "observe", lambda *of: observed.append(1) or observe(*of))
     image = picture(pose_from(30, 45, 520))
     for _ in range(200):
         seen.update(image, pose_from(30, 45, 520))

@@ -57,7 +57,7 @@ def against(model: Model | None, seed: int, noise: float = 3.0) -> dict[str, flo
     """Log odds against each component by one picture."""
     pose = POSES[seed % len(POSES)]
     image = picture(pose, model or walled(), seed=seed, scene=seed % 9, noise=noise)
-    observation = monitor().observe(image, wrong(pose, np.random.default_rng(seed), 0.2, 0.4, walled()))
+    observation = monitor().observer.observe(image, wrong(pose, np.random.default_rng(seed), 0.2, 0.4, walled()))
     return dict(zip([part.name for part in walled().components], observation.log_odds.tolist(), strict=True))
 
 
@@ -136,7 +136,7 @@ def test_a_verified_component_is_not_searched_for(monkeypatch: pytest.MonkeyPatc
         count = len(walled().components)
         return Alternatives(np.full(count, -np.inf), np.zeros((count, 3)))
 
-    monkeypatch.setattr(monitor()._observer._search, "search", never)
+    monkeypatch.setattr(monitor().observer._search, "search", never)
     image = picture(POSES[0], walled(), seed=1, noise=3.0)
     monitor().reset()
     for _ in range(4):

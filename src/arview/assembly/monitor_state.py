@@ -1,4 +1,8 @@
-"""What is known of the components of the part in view."""
+"""What is known of the components of the part in view: the sum of the evidence of single pictures.
+
+Log odds add up over pictures from different directions until a threshold is passed, as in Wald's sequential test
+(1945).
+"""
 
 from __future__ import annotations
 
@@ -8,8 +12,35 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arview.assembly.direction_evidence import DirectionEvidence
+from arview.assembly.observation import Observation
 from arview.assembly.turned_poses import Turn
 from arview.geometry import Array
+
+MISMATCH_LOG_ODDS = 2.0
+"""A component with more becomes mismatched: it is named, and the pose is no longer sure."""
+MISSING_LOG_ODDS = 4.0
+"""A mismatched component with more becomes missing, or displaced. Observations from one direction do not reach it soon:
+a pose that is a little wrong looks the same for a while."""
+CLEARED_LOG_ODDS = 0.1
+"""A mismatched component with less is cleared; other components with more are uncertain."""
+VERIFIED_LOG_ODDS = -4.0
+"""A component with less is verified: the odds that it is not there are below 1 to 50."""
+SUSPECT_LOG_ODDS = 1.0
+"""A component with more probably is not where the CAD has it."""
+SETTLED_LOG_ODDS = 4.5
+"""A mismatched component with more is no reason to observe sooner."""
+SAME_SHIFT = 0.05
+"""Alternative placements that differ by less than this share of the part's diameter are the same."""
+MAX_ADDED = 1.6
+"""Cap on the log odds that one observation adds against a component, because one entering the view is at first only
+partly visible."""
+MAX_LOG_ODDS = 6.0
+"""Bound on the summed log odds, in both directions."""
+FORGETTING = 0.01
+"""Share of the summed log odds that is lost with each observation."""
+FIRST_OBSERVATIONS = 2
+"""Frames after a lock that are all observed. No component is called mismatched before the last of them, because noise
+differs between frames."""
 
 
 @dataclass
@@ -46,6 +77,65 @@ class MonitorState:
     observations: int = 0
     frames_since: int = 0
 
+    @classmethod
+    def unknown(cls, count: int, center_in_model: Array) -> MonitorState:
+        """Nothing is known of the components, whose number is given, of a part with its centre (3,) in mm."""
+        flags = [np.zeros(count, dtype=bool) for _ in range(5)]
+        directions = DirectionEvidence(count, center_in_model)
+        return cls(np.zeros(count), directions, *flags, np.zeros(count), np.zeros((count, 3)))
+
+    @property
+    def is_uncertain(self) -> NDArray[np.bool_]:
+        """(C,) components against which there is some evidence, but not enough."""
+        return np.asarray((self.log_odds > CLEARED_LOG_ODDS) & ~self.is_mismatched)
+
+    @property
+    def is_suspect(self) -> NDArray[np.bool_]:
+        """(C,) components that probably are not where the CAD has them."""
+        return self.is_mismatched | (self.log_odds > SUSPECT_LOG_ODDS)
+
+    @property
+    def is_settled(self) -> NDArray[np.bool_]:
+        """(C,) mismatched components of which no more evidence is needed soon."""
+        return self.is_mismatched & (self.log_odds > SETTLED_LOG_ODDS)
+
+    def add(self, observation: Observation, cam_from_model: Array, sharpness: float, diameter_mm: float) -> None:
+        """Add the evidence of one picture.
+
+        Args:
+            observation: of all components.
+            cam_from_model: (4,4) mm.
+            sharpness: share of the evidence against components that counts, 0–1.
+            diameter_mm: of the part.
+        """
+        self.observations += 1
+        self.frames_since = 0
+        self.has_suspects = bool((observation.is_suspect & ~self.is_settled).any())
+        self.was_visible, self.was_occluded = observation.is_visible, observation.is_occluded
+        capped = np.minimum(observation.log_odds, MAX_ADDED)
+        capped = np.where(capped > 0.0, sharpness * capped, capped)
+        added = self.directions.add(cam_from_model, capped, self.is_mismatched)
+        self.log_odds = np.clip((1.0 - FORGETTING) * self.log_odds + added, -MAX_LOG_ODDS, MAX_LOG_ODDS)
+        self._add_alternatives(observation, SAME_SHIFT * diameter_mm)
+        verified_below = np.where(self.is_verified, CLEARED_LOG_ODDS, VERIFIED_LOG_ODDS)
+        self.is_verified = self.log_odds < verified_below
+        if self.observations >= FIRST_OBSERVATIONS:
+            mismatched_above = np.where(self.is_mismatched, CLEARED_LOG_ODDS, MISMATCH_LOG_ODDS)
+            self.is_mismatched = self.log_odds > mismatched_above
+        self.is_missing = self.is_mismatched & (self.is_missing | (self.log_odds > MISSING_LOG_ODDS))
+
+    def _add_alternatives(self, observation: Observation, same_mm: float) -> None:
+        """Add the evidence of one observation for alternative placements, as long as these are the same."""
+        is_searched = np.isfinite(observation.alternative)
+        apart = np.linalg.norm(observation.shifts - self.shifts, axis=1)
+        is_same = apart < same_mm
+        seen = np.where(is_searched, np.clip(observation.alternative, -MAX_ADDED, MAX_ADDED), 0.0)
+        before = np.where(is_same | ~is_searched, self.alternative, np.maximum(self.alternative - MAX_ADDED, 0.0))
+        is_better = is_searched & (is_same | (seen > before))
+        self.shifts = np.where(is_better[:, None], observation.shifts, self.shifts)
+        total = np.where(is_same | ~is_searched, before + seen, np.maximum(before, seen))
+        self.alternative = np.clip(total, 0.0, MAX_LOG_ODDS)
+
     def turned(self, turn: Turn, share: float) -> MonitorState:
         """The state after the pose is found to be turned.
 
@@ -72,19 +162,15 @@ class MonitorState:
             observations=self.observations,
         )
 
-    def followed_by(
-        self, later: MonitorState, share: float, max_log_odds: float, cleared_log_odds: float
-    ) -> MonitorState:
+    def followed_by(self, later: MonitorState, share: float) -> MonitorState:
         """Evidence of this state and a later one of the same specimen say together.
 
         Args:
             later: since the part was found again.
             share: of the log odds of this state, that counts.
-            max_log_odds: bound on the summed log odds.
-            cleared_log_odds: a component with more is not verified, one with less not mismatched.
         """
-        summed = np.clip(share * self.log_odds + later.log_odds, -max_log_odds, max_log_odds)
-        is_wrong = summed > cleared_log_odds
+        summed = np.clip(share * self.log_odds + later.log_odds, -MAX_LOG_ODDS, MAX_LOG_ODDS)
+        is_wrong = summed > CLEARED_LOG_ODDS
         is_later = later.alternative > self.alternative
         return replace(
             later,

@@ -128,6 +128,11 @@ class ComponentObserver:
         low, high = model.bounds_in_model
         self._corners_in_model = np.array([[(low, high)[i >> k & 1][k] for k in range(3)] for i in range(8)])
 
+    def shows_more(self, image: NDArray[np.uint8], pose: Array, than: Array) -> bool:
+        """Whether a picture shows more components at a pose (4,4) than at another."""
+        there, here = (self.pose_evidence(image, one).seen.sum() for one in (pose, than))
+        return bool(there > here)
+
     def observe(self, image: NDArray[np.uint8], cam_from_model: Array, known: Known | None = None) -> Observation:
         """Observe all components at a pose.
 

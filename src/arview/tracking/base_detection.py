@@ -135,7 +135,7 @@ class BaseDetection:
             return None
         pose = found[0].cam_from_model
         is_there = self.is_same(components, pose, cam_from_model)
-        return found[0] if is_there or components.shows_more(image, pose, cam_from_model) else None
+        return found[0] if is_there or components.observer.shows_more(image, pose, cam_from_model) else None
 
     def is_same(self, components: AssemblyMonitor, a: Array, b: Array) -> bool:
         """Whether two poses (4,4) are the same, or would be if the base had no other components."""

@@ -295,7 +295,7 @@ class SpecimenTracking:
         Where only the base was found, no other component is expected until it is seen.
         """
         if rests_on_base:
-            lines = self.components.base_lines(self._part, cam_from_model, self.search.base_part)
+            lines = self.components.lines(self._part, cam_from_model, self.search.base_part, is_base_only=True)
             self.tracker.expect(lines)
         self.tracker.start(image, cam_from_model)
         if turn is None:
@@ -356,7 +356,7 @@ class SpecimenTracking:
         s.is_supported = s.state == TrackingState.TRACKED
         self.components.update(image, estimate.cam_from_model, estimate.quality, s.is_supported)
         pose, base_part = estimate.cam_from_model, self.search.base_part
-        self.tracker.expect(self.components.present_lines(self._part, pose, base_part))
+        self.tracker.expect(self.components.lines(self._part, pose, base_part))
         reasons = [text for text in (reason, *self.components.mismatches) if text]
         if self.components.uncertain and not reasons:
             reasons = [f"in doubt: {', '.join(self.components.uncertain)}"]
