@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from arview.acceptance.lengths import K, KnownLength, MeasuredMarks, covariance_of_lengths
-from arview.core.least_squares import covariance_root
+from arview.core.fits import covariance_root
 from arview.errors import InputError
 from arview.inspection import Verdict
 from arview.measurement import decide

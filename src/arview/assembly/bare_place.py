@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arview.assembly.edge_support import FoundPoints
-from arview.core.least_squares import robust_sigma
+from arview.core.fits import robust_sigma
 from arview.geometry import Array
 from arview.guideviews import Surface, draw_surface
 from arview.refinement import project

@@ -11,7 +11,7 @@ from arview.cad.fitness import face_areas
 from arview.cad.mesh_topology import edge_faces
 from arview.cad.model import Component
 from arview.cad.part import Datum, Part
-from arview.core.least_squares import fit_circle
+from arview.core.fits import fit_circle
 from arview.geometry import Array
 
 SHARP_DEG = 25.0

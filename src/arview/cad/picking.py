@@ -16,7 +16,7 @@ from arview.cad.fitness import face_areas
 from arview.cad.mesh_topology import edge_faces
 from arview.cad.model import Component
 from arview.cad.part import DatumFeature
-from arview.core.least_squares import fit_circle
+from arview.core.fits import fit_circle
 from arview.errors import InputError
 from arview.geometry import Array
 

@@ -19,7 +19,7 @@ from arview.calibration.fisheye import adjust_fisheye
 from arview.calibration.projection import PARAMETERS_OF, CalibratedLens, lens_of, project
 from arview.calibration.views import MIN_CORNERS, BoardView
 from arview.camera import MAX_HALF_ANGLE_DEG, Camera
-from arview.core.least_squares import without_span
+from arview.core.fits import without_span
 from arview.errors import InputError
 from arview.geometry import Array, rigid
 

@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.core.least_squares import row_space
+from arview.core.fits import row_space
 from arview.errors import InputError
 from arview.geometry import Array, exp_so3, invert, rigid
 

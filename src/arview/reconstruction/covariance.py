@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from arview.core.least_squares import robust_sigma
+from arview.core.fits import robust_sigma
 from arview.geometry import Array, skew
 from arview.reconstruction.colmap import import_pycolmap
 from arview.reconstruction.types import SparseModel

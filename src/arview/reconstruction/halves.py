@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from arview.core.least_squares import fit_similarity
+from arview.core.fits import fit_similarity
 from arview.errors import CannotMeasureError
 from arview.geometry import Array
 from arview.reconstruction.colmap import import_pycolmap, read_reconstruction, sparse_model_of

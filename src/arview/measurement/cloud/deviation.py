@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from arview.cad import Component, Model, Part
-from arview.core.least_squares import orthogonal_complement, row_space
+from arview.core.fits import orthogonal_complement, row_space
 from arview.errors import InputError
 from arview.geometry import Array, apply, invert, rigid
 from arview.measurement.cloud.mesh_surface import MeshSurface

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from arview.cad import Model
 from arview.core.atomic import write_file
-from arview.core.least_squares import robust_sigma
+from arview.core.fits import robust_sigma
 from arview.errors import InputError
 from arview.geometry import Array, apply, look_at
 from arview.inspection import DistanceStatistics

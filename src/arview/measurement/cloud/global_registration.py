@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from arview.cad import Model
-from arview.core.least_squares import TUKEY_SIGMAS
+from arview.core.fits import TUKEY_SIGMAS
 from arview.core.parallel import pool
 from arview.errors import InputError
 from arview.geometry import Array, apply, exp_so3, invert, rigid

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.core.least_squares import nearest_covariance
+from arview.core.fits import nearest_covariance
 from arview.geometry import Array
 
 _SHARES = np.array([0.0, 0.03, 0.1, 0.2, 0.35, 0.5, 0.7, 0.85, 0.95])

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.core.least_squares import orthogonal_complement, robust_sigma, row_space, tukey_weights
+from arview.core.fits import orthogonal_complement, robust_sigma, row_space, tukey_weights
 from arview.errors import InputError
 from arview.geometry import Array, apply, exp_so3, log_so3, rigid
 from arview.measurement.cloud.mesh_surface import MeshSurface

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from arview.cad import Model
-from arview.core.least_squares import robust_sigma
+from arview.core.fits import robust_sigma
 from arview.errors import InputError
 from arview.geometry import Array, exp_so3, rigid
 from arview.measurement.cloud.mesh_surface import MeshSurface

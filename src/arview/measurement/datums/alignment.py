@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from arview.core.least_squares import intersection, orthogonal_complement
+from arview.core.fits import intersection, orthogonal_complement
 from arview.errors import InputError
 from arview.geometry import Array, exp_so3, rigid
 from arview.measurement.datums.datum_fit import DatumFit, check_fit_covered, fit_datum

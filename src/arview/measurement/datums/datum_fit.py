@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.core.least_squares import robust_sigma, tukey_weights
+from arview.core.fits import robust_sigma, tukey_weights
 from arview.geometry import Array
 from arview.measurement.datums.directions import shift_origin
 from arview.measurement.datums.equations import DatumEquations, DatumNotMeasuredError

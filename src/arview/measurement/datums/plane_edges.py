@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from arview.cad import Datum
-from arview.core.least_squares import orthogonal_complement
+from arview.core.fits import orthogonal_complement
 from arview.geometry import Array, exp_so3, log_so3, rigid
 from arview.measurement.datums.equations import DatumEquations, DatumNotMeasuredError, move_equations
 from arview.measurement.datums.options import REACH_MM

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from arview.core.fits import orthogonal_complement, robust_sigma, tukey_weights
 from arview.core.kernel import kernel
-from arview.core.least_squares import orthogonal_complement, robust_sigma, tukey_weights
 from arview.geometry import Array
 
 _MAX_ITERATIONS = 20

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arview.cad import Component, Model, Part, Samples, Symmetry, find_symmetries, make_model
+from arview.core.fits import row_space
 from arview.core.kernel import kernel
-from arview.core.least_squares import row_space
 from arview.geometry import Array
 from arview.rendering import RayCaster
 from arview.rendering.mesh_edges import mesh_edges

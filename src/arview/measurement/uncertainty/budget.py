@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.core.least_squares import covariance_root
+from arview.core.fits import covariance_root
 from arview.errors import InputError
 from arview.geometry import Array, exp_so3
 from arview.measurement.datums.alignment import Alignment

@@ -8,7 +8,7 @@ from itertools import combinations
 
 import numpy as np
 
-from arview.core.least_squares import intersection, orthogonal_complement
+from arview.core.fits import intersection, orthogonal_complement
 from arview.errors import InputError
 from arview.geometry import Array
 from arview.measurement.types import Method, Move, moved_to

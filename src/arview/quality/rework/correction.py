@@ -8,7 +8,7 @@ import numpy as np
 
 from arview import measurement
 from arview.cad import Model, Part
-from arview.core.least_squares import row_space
+from arview.core.fits import row_space
 from arview.geometry import Array, apply, log_so3
 from arview.inspection import MEASURANDS, ComponentDeviation
 from arview.quality.rework.words import up_of

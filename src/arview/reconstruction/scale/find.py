@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arview.cad import Part
-from arview.core.least_squares import nearest_covariance
+from arview.core.fits import nearest_covariance
 from arview.core.progress import Progress
 from arview.reconstruction.scale.cad import CadFind, CadOptions, NotFound, Pixels, find_cad
 from arview.reconstruction.scale.consistency import check_consistency

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from arview.cad import Model
 from arview.camera import Camera
-from arview.core.least_squares import robust_sigma, tukey_weights
+from arview.core.fits import robust_sigma, tukey_weights
 from arview.core.parallel import pool
 from arview.core.subpixel_edges import choose_steps, find_steps
 from arview.geometry import Array, apply

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from arview.core.least_squares import fit_similarity
+from arview.core.fits import fit_similarity
 from arview.errors import InputError
 from arview.geometry import Array, apply, exp_se3, invert, orthonormalise, rigid
 

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.core.least_squares import robust_sigma
+from arview.core.fits import robust_sigma
 from arview.core.parallel import pool
 from arview.fiducials import Board, CornerKey, Tags, cv_board, find_corners
 from arview.geometry import Array

@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from arview.core.least_squares import fit_similarity
+from arview.core.fits import fit_similarity
 from arview.errors import InputError
 from arview.geometry import Array, apply
 from arview.measurement.cloud.registration import move_about

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from arview.core import least_squares
-from arview.core.least_squares import robust_sigma, tukey_weights
+from arview.core.fits import robust_sigma, tukey_weights
 from arview.errors import InputError
 from arview.geometry import Array
 

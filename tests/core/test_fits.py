@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from arview.core.least_squares import (
+from arview.core.fits import (
     covariance_root,
     fit_circle,
     fit_similarity,
