@@ -231,10 +231,11 @@ def annotate(
             )
         if (estimate := session.finish()) is not None:
             keep(estimate)
-    if sink is not None and sink.audio_note:
-        say(f"warning: {sink.audio_note}")
-    written = [path for path in (outputs.video, outputs.poses) if path is not None]
-    _print_summary(summary, written, frames.notes, session.camera_of(0) if is_guessed else None)
+    notes = [
+        *([f"warning: {sink.audio_note}"] if sink and sink.audio_note else []),
+        *map("note: {}".format, frames.notes),
+    ]
+    _print_summary(summary, outputs, notes, session.camera_of(0) if is_guessed else None)
     _save_learned(session, outputs.learned)
     _exit_if_interrupted(ctx, summary)
     ctx.exit(presence_exit_code(summary) if check_presence else finding_exit_code(summary))
@@ -340,18 +341,19 @@ def _save_learned(session: tracking.TrackingSession, path: Path | None) -> None:
         click.echo(f"wrote {path}: {len(memory)} learned views")
 
 
-def _print_summary(summary: AnnotateSummary, written: list[Path], notes: Sequence[str], guessed: Camera | None) -> None:
-    """Say what was done: files, notes of the source, counts, and what a guessed camera may have to do with them."""
+def _print_summary(summary: AnnotateSummary, outputs: _Outputs, notes: Sequence[str], guessed: Camera | None) -> None:
+    """Say what was done: notes, files, counts, and what a guessed camera may have to do with them."""
     from arview.annotation import summary_lines
 
     for note in notes:
-        say(f"note: {note}")
+        say(note)
     if summary.ended_reason:
         say(f"warning: {summary.ended_reason}")
     if summary.frames == 0:
         click.echo("no frame was processed; nothing is written")
         return
-    for line in [*(f"wrote {path}" for path in written), *summary_lines(summary)]:
+    written = [f"wrote {path}" for path in (outputs.video, outputs.poses) if path is not None]
+    for line in [*written, *summary_lines(summary)]:
         click.echo(line)
     if guessed is not None and finding_exit_code(summary) is not ExitCode.DONE:
         click.echo(likely_cause(guessed))
