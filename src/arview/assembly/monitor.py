@@ -260,7 +260,7 @@ class AssemblyMonitor:
 
 
 def _named(names: Sequence[str], is_meant: NDArray[np.bool_]) -> tuple[str, ...]:
-    return tuple(names[index] for index in np.flatnonzero(is_meant))
+    return tuple(name for name, is_it in zip(names, is_meant, strict=True) if is_it)
 
 
 def _messages(names: Sequence[str], is_wrong: NDArray[np.bool_]) -> tuple[str, ...]:

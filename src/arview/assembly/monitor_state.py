@@ -80,9 +80,17 @@ class MonitorState:
     @classmethod
     def unknown(cls, count: int, center_in_model: Array) -> MonitorState:
         """Nothing is known of the components, whose number is given, of a part with its centre (3,) in mm."""
-        flags = [np.zeros(count, dtype=bool) for _ in range(5)]
-        directions = DirectionEvidence(count, center_in_model)
-        return cls(np.zeros(count), directions, *flags, np.zeros(count), np.zeros((count, 3)))
+        return cls(
+            log_odds=np.zeros(count),
+            directions=DirectionEvidence(count, center_in_model),
+            is_mismatched=np.zeros(count, dtype=bool),
+            is_missing=np.zeros(count, dtype=bool),
+            is_verified=np.zeros(count, dtype=bool),
+            was_visible=np.zeros(count, dtype=bool),
+            was_occluded=np.zeros(count, dtype=bool),
+            alternative=np.zeros(count),
+            shifts=np.zeros((count, 3)),
+        )
 
     @property
     def is_uncertain(self) -> NDArray[np.bool_]:
