@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from arview.core import fits
+from arview.core import fits as core_fits
 from arview.core.fits import robust_sigma, tukey_weights
 from arview.errors import InputError
 from arview.geometry import Array
@@ -138,7 +138,7 @@ def fit_cylinder(
         return distance - x[4], rows
 
     known = radius_mm if radius_mm is not None else np.nan
-    center, radius = fits.fit_circle(local[:, :2])
+    center, radius = core_fits.fit_circle(local[:, :2])
     start = np.array([*center, 0.0, 0.0, radius if radius_mm is None else known])
     x, weights, rest = _solve(residuals, start, 5 if radius_mm is None else 4, is_robust)
     axis = np.array([x[2], x[3], 1.0]) @ frame
@@ -163,7 +163,7 @@ def fit_circle(points: Array, normal: Array | None = None, is_robust: bool = Tru
         distance = np.maximum(np.linalg.norm(away, axis=1), 1e-9)
         return distance - x[2], np.column_stack([-away / distance[:, None], -np.ones(len(local))])
 
-    center, radius = fits.fit_circle(local)
+    center, radius = core_fits.fit_circle(local)
     x, weights, rest = _solve(residuals, np.array([*center, radius]), 3, is_robust)
     return Circle(plane.point + np.array([x[0], x[1], 0.0]) @ frame, frame[2], float(x[2]), *_quality(rest, weights))
 
