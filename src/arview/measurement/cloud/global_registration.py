@@ -12,12 +12,12 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from arview.cad import Model
-from arview.core.fits import TUKEY_SIGMAS
 from arview.core.parallel import pool
 from arview.errors import InputError
 from arview.geometry import Array, apply, exp_so3, invert, rigid
 from arview.measurement.cloud.mesh_surface import MeshSurface
 from arview.measurement.cloud.pair_registration import find_by_pairs
+from arview.measurement.cloud.scale_check import fit_similarity_to_surface
 from arview.reconstruction import DenseCloud, Similarity
 
 POINTS = 4000
@@ -26,6 +26,8 @@ VOXELS = 40
 """Voxels across the diameter: components are some voxels wide."""
 STEP_DEG = 6.0
 """Step of the rotations about a principal direction; refinement converges from half of it."""
+REACH, NOISE = 9.0, 0.25
+"""Largest distance of points from the surface in the first and in the last step of the refinement, over the limit."""
 KEPT = 12
 """Poses that are refined and compared."""
 SCALE_STEP = 1.08
@@ -73,26 +75,28 @@ def find_model_in_cloud(cloud: DenseCloud, model: Model, scale: float | None = 1
     limit_mm = LIMIT_SHARE * model.diameter_mm
     # A thin plate also fits with its top on its bottom, so there are starts displaced to both sides.
     step = 0.8 * model.diameter_mm / VOXELS * _main_axes(surface.face_normals[of_face], 1)[0]
-    tried = [(s, rigid(np.eye(3), k * step) @ pose) for _, s, pose in _separated(places) for k in (-1.0, 0.0, 1.0)]
+    tried = [
+        Similarity(s, rigid(np.eye(3), k * step) @ pose) for _, s, pose in _separated(places) for k in (-1.0, 0.0, 1.0)
+    ]
     sides = normals if is_oriented else None
-    fits = list(pool().map(lambda job: _refined(points, sides, surface, samples, job, True, limit_mm), tried))
+    fits = list(pool().map(lambda start: _refined(points, sides, surface, samples, start, limit_mm), tried))
     fits.sort(key=lambda fit: fit[0])
-    cost, found_scale, pose = fits[0]
-    around = _around(apply(pose, points * found_scale), samples, limit_mm)
+    cost, found = fits[0]
+    around = _around(found.points_in_model(points), samples, limit_mm)
     cost -= around * limit_mm
     if around > 0.7 or cost > 0.6 * limit_mm * (1.0 - around):
         raise InputError("cloud: the part was not found in it: another part, or too little of it")
-    for rival_cost, _, rival in fits[1:]:
+    for rival_cost, rival in fits[1:]:
         if rival_cost - around * limit_mm > MIN_LEAD * cost + 1e-3 * limit_mm:
             break
-        moved = apply(rival @ invert(pose), samples)
+        moved = apply(rival.model_from_scan @ invert(found.model_from_scan), samples)
         other_mm = np.abs(surface.closest(moved).distances)
         if np.mean(np.linalg.norm(moved - samples, axis=1)) > limit_mm and np.mean(other_mm) > 0.1 * limit_mm:
             raise InputError(
                 "cloud: the part fits in two ways equally, and in neither of them well: the cloud is mirrored, of "
                 "another part, or shows too little of what distinguishes its sides"
             )
-    return Similarity(found_scale, pose)
+    return found
 
 
 def _some_points(cloud: DenseCloud) -> tuple[Array, Array, bool]:
@@ -210,51 +214,24 @@ def _separated(places: list[tuple[float, float, Array]]) -> list[tuple[float, fl
 
 
 def _refined(
-    points: Array,
-    normals: Array | None,
-    surface: MeshSurface,
-    samples: Array,
-    start: tuple[float, Array],
-    with_scale: bool,
-    limit_mm: float,
-) -> tuple[float, float, Array]:
-    """Cost, scale and pose (4,4) on the exact surface: Gauss–Newton on up to seven parameters with Tukey's weights."""
-    scale, pose = start
-    width, size = 4.0 * limit_mm, 0.25 * float(np.linalg.norm(np.ptp(samples, axis=0)))
-    for _ in range(40):
-        moved = apply(pose, points * scale)
-        closest = surface.closest(moved, TUKEY_SIGMAS * width)
-        near = closest.faces >= 0
-        if normals is not None:
-            near &= np.sum(np.nan_to_num(closest.normals) * (normals @ pose[:3, :3].T), axis=1) > 0.3
-        if np.count_nonzero(near) < 50:
-            return np.inf, scale, pose
-        x, n, r = moved[near], closest.normals[near], closest.distances[near]
-        center = x.mean(axis=0)
-        rows = np.hstack([np.cross(x - center, n) / size, n, np.sum(n * (x - center), axis=1)[:, None] / size])
-        rows = rows if with_scale else rows[:, :6]
-        weights = (1.0 - np.minimum(np.abs(r) / (TUKEY_SIGMAS * width), 1.0) ** 2) ** 2
-        normal = (rows * weights[:, None]).T @ rows
-        step = -np.linalg.solve(normal + 1e-6 * np.trace(normal) * np.eye(len(normal)), (rows * weights[:, None]).T @ r)
-        grown = 1.0 + step[6] / size if with_scale else 1.0
-        turn = exp_so3(step[:3] / size)
-        pose = rigid(turn, center + step[3:6] - turn @ center) @ pose
-        if with_scale:
-            scale, about = scale * grown, pose[:3, :3].T @ (center - pose[:3, 3])
-            pose = rigid(pose[:3, :3], pose[:3, 3] + pose[:3, :3] @ about * (1.0 - grown))
-        if np.abs(step).max() < 1e-4 * size and width <= 0.05 * limit_mm:
-            break
-        width = max(0.6 * width, 0.05 * limit_mm)
+    points: Array, normals: Array | None, surface: MeshSurface, samples: Array, start: Similarity, limit_mm: float
+) -> tuple[float, Similarity]:
+    """Cost and place on the exact surface of points, refined as a similarity."""
+    size = 0.25 * float(np.linalg.norm(np.ptp(samples, axis=0)))
+    fit = fit_similarity_to_surface(points, surface, size, REACH * limit_mm, NOISE * limit_mm, start, normals)
+    if fit is None:
+        return np.inf, start
+    found = fit.similarity
     # Distances both ways: from points to the surface and from the surface to points. What lies around the part costs
     # the same for every pose.
-    moved = apply(pose, points * scale)
+    moved = found.points_in_model(points)
     closest = surface.closest(moved)
     of_points = np.minimum(np.abs(closest.distances), limit_mm)
     if normals is not None:
-        of_points[np.sum(closest.normals * (normals @ pose[:3, :3].T), axis=1) < 0.0] = limit_mm
+        of_points[np.sum(closest.normals * (normals @ found.model_from_scan[:3, :3].T), axis=1) < 0.0] = limit_mm
     apart = cKDTree(moved).query(samples)[0]
     to_points = np.clip(apart - 2.0 * np.median(apart), 0.0, limit_mm)  # less the spacing of the points
-    return float(of_points.mean() + 0.3 * to_points.mean()), scale, pose
+    return float(of_points.mean() + 0.3 * to_points.mean()), found
 
 
 def _around(points: Array, samples: Array, limit_mm: float) -> float:

@@ -9,7 +9,7 @@ speaks against a pose.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +28,8 @@ MODEL_POINTS = 2400
 """Points of the CAD whose pairs are matched."""
 FIRST_PAIRS = 7000
 """Pairs of the cloud that are matched in the first round, which finds what is the main thing in the cloud."""
+PAIRS = 24_000
+"""Pairs of the cloud that are matched in each later round."""
 PROBES = 3
 """Cells of the table in which each pair is looked up, because noise moves it between them."""
 MATCHES = 40
@@ -69,13 +71,6 @@ SEED = 0
 
 
 @dataclass(frozen=True)
-class PairRegistrationOptions:
-    """Options of the search. Lengths are shares of the model's diameter unless named otherwise."""
-
-    pairs: int = 24_000  # pairs of the cloud that are tried
-
-
-@dataclass(frozen=True)
 class PartPlacement:
     """A place of the CAD in a cloud.
 
@@ -114,18 +109,15 @@ class _Target:
     cell: float
 
 
-def find_by_pairs(
-    points: Array, normals: Array | None, model: Model, options: PairRegistrationOptions | None = None
-) -> PartPlacement:
+def find_by_pairs(points: Array, normals: Array | None, model: Model) -> PartPlacement:
     """Place of the model in points (N,3) in mm, all finite, with normals (N,3) or None.
 
     Raises:
         InputError: there are too few points, the part is not found, or two places fit alike that no symmetry relates.
     """
-    o = options or PairRegistrationOptions()
     target = _target(model)
     scene = scene_points(points, normals, target.diameter_mm)
-    found = candidates(scene, target, o)
+    found = candidates(scene, target)
     if not found or found[0].score < MIN_SHARE or found[0].inside > MAX_INSIDE:
         raise InputError("cloud: the part was not found in it: another part, or too little of it")
     best = found[0]
@@ -143,7 +135,7 @@ def find_by_pairs(
     return best
 
 
-def candidates(scene: ScenePoints, target: _Target, o: PairRegistrationOptions) -> list[PartPlacement]:
+def candidates(scene: ScenePoints, target: _Target) -> list[PartPlacement]:
     """Different places of the CAD in the cloud, the best first."""
     rng = np.random.default_rng(SEED)
     tables = _PairTable(target)
@@ -151,8 +143,7 @@ def candidates(scene: ScenePoints, target: _Target, o: PairRegistrationOptions) 
     placements: list[PartPlacement] = []
     signs = (1.0, -1.0) if scene.is_oriented else (1.0,)
     for turn, sign in enumerate(signs * ROUNDS):
-        count = o.pairs if turn >= len(signs) else FIRST_PAIRS
-        pairs = _scene_pairs(scene, target, replace(o, pairs=count), rng)
+        pairs = _scene_pairs(scene, target, PAIRS if turn >= len(signs) else FIRST_PAIRS, rng)
         turned = sign * scene.normals
         chosen, matches = tables.lookup(scene.points, turned, pairs, rng, target.diameter_mm)
         poses = hypotheses(
@@ -273,13 +264,11 @@ class _PairTable:
         return key
 
 
-def _scene_pairs(
-    scene: ScenePoints, target: _Target, o: PairRegistrationOptions, rng: np.random.Generator
-) -> NDArray[np.int64]:
+def _scene_pairs(scene: ScenePoints, target: _Target, count: int, rng: np.random.Generator) -> NDArray[np.int64]:
     """(K,2) pairs of scene points within the range, with normals that are not parallel, rare ones preferred."""
     share = scene.weights / scene.weights.sum()
     tree = cKDTree(scene.points)
-    firsts = rng.choice(len(scene.points), size=min(o.pairs // 12 + 1, 3 * len(scene.points)), p=share)
+    firsts = rng.choice(len(scene.points), size=min(count // 12 + 1, 3 * len(scene.points)), p=share)
     found = []
     for first in firsts:
         near = np.array(tree.query_ball_point(scene.points[first], PAIR_RANGE[1] * target.diameter_mm))
