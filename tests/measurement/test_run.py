@@ -18,7 +18,6 @@ from arview.errors import InputError
 from arview.geometry import Array, apply, exp_so3, invert, rigid
 from arview.inspection import Inspection, Verdict, load_inspection, save_inspection
 from arview.inspection.summary import overall_verdict
-from arview.measurement import folder as folder_module
 from arview.measurement import run
 from arview.measurement.datums.planes import base_plane, plane_samples
 from arview.measurement.datums.rims import find_rim
@@ -272,8 +271,8 @@ def test_the_command(inspection: Inspection, monkeypatch: pytest.MonkeyPatch, tm
         seen.append(options)
         return inspection
 
-    monkeypatch.setattr(run, "measure", fake)
-    monkeypatch.setattr(folder_module, "read_folder", lambda *args: None)
+    monkeypatch.setattr("arview.measurement.measure", fake)
+    monkeypatch.setattr("arview.measurement.read_folder", lambda *args: None)
     monkeypatch.setattr("arview.cad.load_part", lambda path, unit: part())
     out = tmp_path / "inspection.json"
     arguments = ["measure", str(tmp_path), "--part", "p.toml", "-o", str(out)]

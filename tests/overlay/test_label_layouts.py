@@ -99,7 +99,8 @@ def test_thirty_layouts(size: tuple[int, int], kind: str, seed: int) -> None:
     focal = 1.2 * min(width, height) * rng.uniform(0.9, 1.8)
     camera = Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
     model = forty(kind)
-    renderer = OverlayRenderer(model, camera, record(model, rng))
+    inspected = record(model, rng)
+    renderer = OverlayRenderer(model, camera, inspected)
     cam_from_model: Array = orbit(rng.uniform(0.0, 360.0), rng.uniform(30.0, 70.0), rng.uniform(350.0, 620.0))
     cam_from_model[:2, 3] += rng.uniform(-70.0, 70.0, 2)
     renderer.draw(np.full((height, width, 3), 118, np.uint8), pose(cam_from_model), 30.0, NOW)
@@ -115,7 +116,7 @@ def test_thirty_layouts(size: tuple[int, int], kind: str, seed: int) -> None:
         assert label.box.y >= 0 and label.box.y + label.box.height <= height - renderer.status_height_px
     assert overlapping(laid_out) == 0
     assert crossed_pairs(laid_out) == []
-    urgent = {one.name for one in renderer.inspection.components if one.verdict != "pass"}  # type: ignore[union-attr]
+    urgent = {one.name for one in inspected.components if one.verdict != "pass"}
     shown = {one.text.name for one in laid_out.labels} | {one.key for one in laid_out.pointers}
     assert urgent and urgent <= shown
     for pointer in laid_out.pointers:

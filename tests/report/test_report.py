@@ -21,7 +21,6 @@ from arview.cli import main
 from arview.errors import MismatchError, MissingDependencyError
 from arview.geometry import Array, apply, exp_so3, invert, rigid
 from arview.inspection import Inspection, save_inspection
-from arview.measurement import folder as folder_module
 from arview.measurement.cloud.distance_map import (
     distance_map,
     read_distance_ply,
@@ -100,7 +99,7 @@ def source(found: Inspection, tmp_path: Path) -> Path:
 
 @pytest.fixture
 def patched(monkeypatch: pytest.MonkeyPatch, reconstruction: MetricReconstruction) -> None:
-    monkeypatch.setattr(folder_module, "read_folder", lambda *_: reconstruction)
+    monkeypatch.setattr("arview.measurement.read_folder", lambda *_: reconstruction)
 
 
 def in_datum_frame(reconstruction: MetricReconstruction) -> SparseModel:

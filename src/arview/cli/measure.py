@@ -109,7 +109,6 @@ def measure(
     """Measure the displacement of each component of PART in the reconstruction OUT, or in a cloud."""
     from arview.cad import load_part
     from arview.inspection import overall_verdict, save_inspection
-    from arview.measurement import run
 
     if (folder is None) == (cloud_path is None):
         raise InputError("give either OUT, the folder of `arview reconstruct`, or --cloud FILE")
@@ -133,7 +132,7 @@ def measure(
         reconstruction = measurement.read_folder(folder, photos, "cloud" in methods)
     try:
         with stage_bar() as progress:
-            inspection = run.measure(reconstruction, part, options, progress=progress)
+            inspection = measurement.measure(reconstruction, part, options, progress=progress)
     except InputError as error:
         if cloud_path is None or not str(error).startswith("cloud: "):
             raise

@@ -12,7 +12,6 @@ from typing import Any
 import pytest
 
 from arview.inspection import load_inspection, save_inspection
-from arview.station.live.jobs import workers
 from arview.station.live.server import hub
 from arview.station.live.stream.frames import to_jpeg
 from arview.station.walk.job import JobFolder, find_job
@@ -32,7 +31,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def server(folder: Path) -> Iterator[Running]:
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(workers, "start_worker", quiet_worker)
+        patched.setattr("arview.station.walk.start_worker", quiet_worker)
         patched.setattr(hub, "RELOAD_INTERVAL_S", 0.1)
         chosen = options(inspection=None, record_folder=folder, clients=4, jobs=job_options(folder))
         with running(chosen, loader(chosen)) as server:
@@ -393,7 +392,7 @@ def test_a_disk_that_is_full_is_said_and_nothing_is_confirmed(page: Http, server
 
 
 def test_pages_of_a_station_camera_show_each_its_own_job(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(workers, "start_worker", quiet_worker)
+    monkeypatch.setattr("arview.station.walk.start_worker", quiet_worker)
     monkeypatch.setattr(hub, "RELOAD_INTERVAL_S", 0.1)
     chosen = options(source=str(CLIP), inspection=None, jobs=job_options(tmp_path))
     with running(chosen, loader(chosen)) as server:

@@ -22,6 +22,7 @@ from arview.station.live.security.addresses import LOOPBACK, bind
 from arview.video import open_source
 from helpers.live_client import Http
 from helpers.live_sample import CAMERA, CLIP, INSPECTION, PART
+from helpers.paths import ROOT
 
 pytestmark = pytest.mark.slow  # each test starts the program
 
@@ -179,5 +180,7 @@ def test_a_missing_extra_says_its_pip_line(monkeypatch: pytest.MonkeyPatch) -> N
 
 def test_help_teaches() -> None:
     text = CliRunner().invoke(main, ["live", "--help"]).output
-    assert text.count("arview live --part") >= 4 and "trust the station" in " ".join(text.split())
+    assert text.count("arview live --part") >= 4
+    notes = (ROOT / "docs" / "reference" / "command-notes.md").read_text(encoding="utf-8")
+    assert "has to be told to trust the station" in " ".join(notes.split())
     assert "live" in CliRunner().invoke(main, ["--help"]).output
