@@ -286,10 +286,10 @@ def test_the_command(inspection: Inspection, monkeypatch: pytest.MonkeyPatch, tm
     assert any(line.startswith("datum B (hole of plate) locks tx ty") for line in lines)
     assert any("missing: block_4" in line for line in lines)
     good = replace(inspection, components=tuple(c for c in inspection.components if c.name == "block_2"))
-    monkeypatch.setattr(run, "measure", lambda *args, **named: good)
+    monkeypatch.setattr("arview.measurement.measure", lambda *args, **named: good)
     assert CliRunner().invoke(main, arguments).exit_code == 0
     undecided = replace(good, components=(replace(good.components[0], verdict=Verdict.UNDECIDED),))
-    monkeypatch.setattr(run, "measure", lambda *args, **named: undecided)
+    monkeypatch.setattr("arview.measurement.measure", lambda *args, **named: undecided)
     assert CliRunner().invoke(main, arguments).exit_code == ExitCode.UNDECIDED
 
 
