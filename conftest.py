@@ -24,7 +24,7 @@ if IS_WORKER:
 ROOT = Path(__file__).parent
 TESTS = ROOT / "tests"
 TIMED_ROOMS = ("station.live", "browser")
-"""Their tests wait for servers, cameras and browsers: one worker takes them all, one after another."""
+"""Their tests wait for servers, cameras and browsers, and come first."""
 DURATIONS = TESTS / "durations.json"
 """Seconds that each test file took, by which the longest start first; ARVIEW_RECORD_DURATIONS=1 writes them anew."""
 MARKER_OF_ROOM = {"browser": "browser", "integration": "integration"}
@@ -46,18 +46,12 @@ def pytest_configure() -> None:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark tests by their folder, and give each file to one worker: what it sets up is made once.
-
-    Workers take the files in this order, so that the longest start first.
-    """
+    """Mark tests by their folder. Workers take whole files in this order, so that the longest start first."""
     for item in items:
         if marker := MARKER_OF_ROOM.get(room(item)):
             item.add_marker(marker)
         if not SHARED.is_dir() and item.get_closest_marker("shared"):
             item.add_marker(pytest.mark.skip(reason=f"{SHARED} is not here"))
-        if IS_WORKER:
-            timed = room(item) in TIMED_ROOMS
-            item.add_marker(pytest.mark.xdist_group("timed" if timed else str(item.path.relative_to(ROOT))))
     if IS_WORKER:
         weights = _weights(items)
         items.sort(key=lambda item: -weights[item.path])
