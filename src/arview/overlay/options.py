@@ -80,12 +80,8 @@ class OverlayOptions:
     def __post_init__(self) -> None:
         if self.show_edges not in get_args(EdgeMode):
             raise InputError(f"overlay: show_edges is {self.show_edges!r}, expected none, visible or all")
-        if UNIT not in get_args(Unit):
-            raise InputError(f"overlay: unit is {UNIT!r}, expected mm or inch")
         if not 0.0 <= self.opacity <= 1.0:
             raise InputError(f"overlay: opacity is {self.opacity}, expected 0 to 1")
-        if not 0 <= DECIMALS <= 4:
-            raise InputError(f"overlay: decimals is {DECIMALS}, expected 0 to 4")
         if self.arrow_scale is not None and not (math.isfinite(self.arrow_scale) and self.arrow_scale > 0):
             raise InputError(f"overlay: arrow_scale is {self.arrow_scale}, expected a positive number")
         if self.max_labels < 0:

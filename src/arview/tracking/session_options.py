@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from arview.detection import DetectorOptions
-from arview.errors import InputError
 
 TRACKED_QUALITY = 0.5
 """Quality needed to become ``tracked``."""
@@ -34,7 +33,3 @@ class SessionOptions:
     use_recheck: bool = True
     use_appearance_memory: bool = True
     detector: DetectorOptions | None = None
-
-    def __post_init__(self) -> None:
-        if not 0 <= LOST_QUALITY <= CRITICAL_QUALITY <= TRACKED_QUALITY <= 1:
-            raise InputError("session: expected 0 ≤ lost_quality ≤ critical_quality ≤ tracked_quality ≤ 1")

@@ -36,9 +36,5 @@ class DenseOptions:
     def __post_init__(self) -> None:
         if self.max_region_px < 10_000:
             raise InputError(f"dense: max_region_px is {self.max_region_px}, expected at least 10000")
-        if not 1 <= BEST_SOURCES <= SOURCES <= 16:
-            raise InputError(f"dense: best_sources {BEST_SOURCES} of sources {SOURCES}, expected 1 to 16 in this order")
-        if not MIN_VIEWS >= 2:
-            raise InputError(f"dense: min_views is {MIN_VIEWS}, expected at least 2")
         if not self.band_mm > 0:
             raise InputError(f"dense: band_mm is {self.band_mm}, expected a positive number")
