@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from types import MappingProxyType
 
+from arview.core.messages import sentence
 from arview.geometry import Array
 
 
@@ -164,5 +165,6 @@ class Pose:
         """Text for a status line: the reason, or, of a tracked part, the components not verified yet."""
         if self.state is not TrackingState.TRACKED or not self.unverified:
             return self.reason
-        few = ", ".join(self.unverified) if len(self.unverified) <= MAX_NAMES else f"{len(self.unverified)} components"
-        return f"not yet verified: {few}"
+        if len(self.unverified) > MAX_NAMES:
+            return sentence("tracking.not_verified_many", count=len(self.unverified))
+        return sentence("tracking.not_verified", names=", ".join(self.unverified))

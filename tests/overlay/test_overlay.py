@@ -20,11 +20,11 @@ from arview.camera import Camera
 from arview.errors import InputError, MismatchError
 from arview.geometry import Array, apply, look_at, rigid
 from arview.inspection import ComponentDeviation, Finding, Inspection, Provenance, Verdict
-from arview.overlay import OverlayOptions, OverlayRenderer, labels, paint
+from arview.overlay import OverlayOptions, OverlayRenderer, age_text, labels, paint
 from arview.overlay.ghost import CELL_PX
 from arview.overlay.layout import LabelLayout, LabelRequest, PlacedLabel
 from arview.overlay.options import VERDICT_RGB
-from arview.overlay.status import StatusLine, age_text
+from arview.overlay.status import StatusLine
 from arview.pose import ComponentPresence, Pose, Presence, TrackingState, Visibility
 from helpers.paths import SHARED
 

@@ -22,6 +22,7 @@ from arview.assembly.present_lines import PresentLines
 from arview.assembly.turned_poses import Turn, TurnedPoses
 from arview.cad import Model
 from arview.camera import Camera
+from arview.core.messages import sentence
 from arview.geometry import Array, are_near
 from arview.guideviews import GuideViewSet
 from arview.pose import ComponentPresence
@@ -264,4 +265,4 @@ def _named(names: Sequence[str], is_meant: NDArray[np.bool_]) -> tuple[str, ...]
 
 
 def _messages(names: Sequence[str], is_wrong: NDArray[np.bool_]) -> tuple[str, ...]:
-    return tuple(f"mismatch: {name} not seen where expected" for name in _named(names, is_wrong))
+    return tuple(sentence("tracking.mismatch", name=name) for name in _named(names, is_wrong))

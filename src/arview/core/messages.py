@@ -1,91 +1,227 @@
-"""Messages: sentences with a key and values, so that a page can say them in its own language; their text is English."""
+"""Messages: the sentences that arview says of what it sees, each with a key and values, made where the thing is known.
+
+A message is its English text, so that files, terminals and drawings use it as it is; a page in another language finds
+its own words by the key.
+"""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
-from functools import cached_property
 from typing import Any, Union
 
 Value = Union[str, int, "Message", tuple["Message", ...]]
 """A value of a message: a name or number, a message, or a list of messages."""
-_PLACE = re.compile(r"\{(\w+)\}")
+
+CATALOGUE = {
+    # Why a pose is weak or missing.
+    "tracking.align": "align the part with the outline",
+    "tracking.nothing_from_to": "nothing like the part in view, {low} to {high} mm away",
+    "tracking.outline_share": "only {share} % of the outline found",
+    "tracking.dark": "too dark",
+    "tracking.bright": "overexposed",
+    "tracking.blurred": "blurred",
+    "tracking.no_edges": "low contrast: hardly an edge in the picture",
+    "tracking.contrast": "low contrast of the part against its background",
+    "tracking.far": "too far: about {distance} mm, declared up to {limit} mm",
+    "tracking.near": "too near: about {distance} mm, declared from {limit} mm",
+    "tracking.small": "too far: the part spans only {span} px",
+    "tracking.large": "too near: the part does not fit in the picture",
+    "tracking.outside": "seen from outside the declared range: azimuth {azimuth}°, elevation {elevation}°",
+    "tracking.turned": "turned outside the declared range: roll {roll}°, declared {first} to {last}°",
+    "tracking.left_at_left": "the part left the picture at the left edge",
+    "tracking.left_at_right": "the part left the picture at the right edge",
+    "tracking.left_at_upper": "the part left the picture at the upper edge",
+    "tracking.left_at_lower": "the part left the picture at the lower edge",
+    "tracking.left": "the part left the picture",
+    "tracking.fast": "the part moved too fast",
+    "tracking.hidden": "the part is hidden or moved too fast",
+    "tracking.partly_left": "partly outside the picture at the left edge",
+    "tracking.partly_right": "partly outside the picture at the right edge",
+    "tracking.partly_upper": "partly outside the picture at the upper edge",
+    "tracking.partly_lower": "partly outside the picture at the lower edge",
+    "tracking.mismatch": "mismatch: {name} not seen where expected",
+    "tracking.in_doubt": "in doubt: {names}",
+    "tracking.not_verified_many": "not yet verified: {count} components",
+    "tracking.not_verified": "not yet verified: {names}",
+    "tracking.other_first": "another part is searched for first",
+    # Whether the specimen in view is the one that was measured.
+    "identity.checking": "checking that this is the part that was followed before",
+    "identity.another": "another part of this kind is in view; confirm that this is the one",
+    "identity.moved": "this part is not where the last one was; confirm that this is the one",
+    "identity.not_found": "no part of this kind found at {place} in frame {frame}; confirm the part",
+    "identity.belongs": "the labels belong to the part at {place} in frame {frame}",
+    "identity.code": "the code on this part says {serial}, the inspection is of {inspected}",
+    "identity.withheld_of": "Labels withheld: this is {serial}",
+    "identity.withheld": "Labels withheld",
+    # Labels and legend of the overlay.
+    "label.missing": "MISSING",
+    "label.displaced": "DISPLACED",
+    "label.unverified": "NOT VERIFIED",
+    "label.uncertain": "UNCERTAIN",
+    "label.withheld": "WITHHELD",
+    "label.seen": "SEEN",
+    "verdict.pass": "PASS",
+    "verdict.fail": "FAIL",
+    "verdict.undecided": "UNDECIDED",
+    "verdict.measured": "MEASURED",
+    "verdict.not_measured": "NOT MEASURED",
+    # Labels and legend of the overlay.
+    "label.away": "≈ {distance} away",
+    "label.turned": "turned {angle}°",
+    "label.changed": "changed since measured",
+    "label.as_measured": "as measured",
+    "label.seen_changed": "seen now: changed since measured",
+    "label.measured_unverified": "measured, not verified here",
+    "label.measured_uncertain": "measured, evidence here conflicts",
+    "label.not_verified": "not verified here",
+    "label.conflicts": "evidence here conflicts",
+    "label.hidden": "hidden by something",
+    "label.one_of_two": "one of two places",
+    "label.one_of": "one of {count} places",
+    "label.measured_on": "measured on {serial}, not on this one",
+    "label.was_missing": "missing",
+    "label.undetermined": "undetermined",
+    "legend.missing": "missing here",
+    "legend.displaced": "displaced: CAD place and where it is",
+    "legend.withheld": "another specimen: nothing measured is shown",
+    "complete.yes": "COMPLETE",
+    "complete.open": "NOT YET CHECKED",
+    "complete.both": "INCOMPLETE: {missing} missing, {displaced} displaced",
+    "complete.missing": "INCOMPLETE: {missing} missing",
+    "complete.displaced": "INCOMPLETE: {displaced} displaced",
+    "complete.no": "INCOMPLETE",
+    # Notices of the station.
+    "told.label_age": "measured {age}",
+    "told.old": "measured {age}: measure again",
+    "told.future": "measured in the future, by {lead}: check the clocks of this machine and of the other",
+    "age.days": "{count} d ago",
+    "age.hours": "{count} h ago",
+    "age.minutes": "{count} min ago",
+    "age.now": "just now",
+    "age.future": "in the future",
+    "told.inspection_none": "no inspection: nothing has been measured",
+    "told.inspection_rough": "first numbers: they are provisional",
+    "told.inspection_serial": "the inspection is of {serial}, this part is {own}",
+    "told.inspection_no_serial": "the inspection is without a serial number, this part is {own}",
+    "told.camera_guessed": "camera not calibrated: distances to the part are only rough",
+    "told.focal": "focal length estimated: {focal} ± {u} px (guessed {guessed})",
+    "told.focal_open": "focal length not determined by these views: the guess of {guessed} px is kept; "
+    "show the part from near and from several sides",
+    "told.scaled": "pictures arrive at {share} of their size",
+    "told.damaged": "pictures arrive damaged: their frame counter cannot be read",
+    "told.restarted": "the tracking failed and was restarted {count} times",
+    "told.same_picture": "the camera delivers the same picture again and again",
+    "told.camera_silent": "the camera delivers no picture for {seconds} s",
+    "told.first_picture": "waiting for the first picture",
+    "told.no_picture": "no picture for {seconds} s",
+    "told.loading": "the part is being loaded",
+    # The state of a job.
+    "walk.starting": "starting",
+    "walk.waiting": "waiting for photos",
+    "walk.photos": "{count} photos",
+    "walk.provisional": "{count} photos; provisional numbers from {placed}",
+    "walk.measuring": "measuring",
+    "walk.first": "reading the first measurement",
+    # Guided capture.
+    "capture.not_tracked": "part not tracked",
+    "capture.uncertain": "pose uncertain",
+    "capture.ambiguous": "view is ambiguous: move on",
+    "capture.other_specimen": "this may be another part",
+    "capture.closer": "closer",
+    "capture.farther": "farther away",
+    "capture.not_inside": "bring the whole part into the picture",
+    "capture.hold_still": "hold still",
+    "capture.not_sharp": "not sharp yet: hold still",
+    "capture.out_of_focus": "out of focus: tap on the part, or clean the lens",
+    "capture.already_taken": "already taken from here: move on",
+    "capture.little_gain": "little to gain from here: move on",
+    "capture.taking": "taking the photo",
+    "capture.too_soon": "wait a moment",
+    "capture.enough": "enough photos",
+    "capture.enough_of": "enough photos: {count}",
+    "capture.more_one": "{count} more photo",
+    "capture.more": "{count} more photos",
+    "capture.more_from": "{count} more from {side}",
+    "capture.more_of": "{count} more: {sides}",
+    "capture.from": "{count} from {side}",
+    "capture.left": "the left",
+    "capture.right": "the right",
+    "capture.above": "above",
+    "capture.below": "below",
+    "capture.other_side": "the other side",
+    "capture.hidden_one": "{name} is hidden from here",
+    "capture.hidden_two": "{first} and {second} are hidden from here",
+    "capture.hidden_many": "{count} components are hidden from here",
+    "capture.both": "{first}; {second}",
+    "capture.other_sides": "more from other sides",
+    "capture.hidden": "hidden from here; {lacking}",
+    "capture.never_seen": "other components hide it from every direction asked for",
+}
+"""The English sentences by key; values stand in braces."""
 
 
-@dataclass(frozen=True)
-class Phrase:
-    """A sentence of a catalogue.
+class Message(str):
+    """A text in English that knows what it says.
 
     Attributes:
-        key: by which pages find it in their language.
-        english: the sentence; values stand in braces, ``{count} more photos``.
+        key: by which pages find the sentence in their language; empty for a text of several sentences.
+        values: of the sentence, by name.
+        parts: the sentences of a text of several.
     """
 
     key: str
-    english: str
+    values: Mapping[str, Value]
+    parts: tuple[str, ...]
 
-    def __call__(self, **values: Value) -> Message:
-        """The sentence with its values.
-
-        Raises:
-            ValueError: the values are not those of the sentence.
-        """
-        if set(values) != self.names:
-            raise ValueError(f"{self.key}: expected values for {sorted(self.names)}, got {sorted(values)}")
-        return Message(self, values)
-
-    @cached_property
-    def names(self) -> frozenset[str]:
-        """Names of its values."""
-        return frozenset(_PLACE.findall(self.english))
-
-    @cached_property
-    def pattern(self) -> re.Pattern[str]:
-        """What matches the sentence with any values; ``count`` is a number."""
-        pieces = _PLACE.split(self.english)
-        values = {name: r"\d+" if name == "count" else ".+?" for name in self.names}
-        plain = [re.escape(one) if k % 2 == 0 else f"(?P<{one}>{values[one]})" for k, one in enumerate(pieces)]
-        return re.compile("".join(plain), re.DOTALL)
-
-
-@dataclass(frozen=True)
-class Message:
-    """A sentence with its values.
-
-    Attributes:
-        phrase: the sentence.
-        values: by name.
-    """
-
-    phrase: Phrase
-    values: Mapping[str, Value] = field(default_factory=dict)
-
-    @property
-    def text(self) -> str:
-        """The message in English."""
-        return _PLACE.sub(lambda found: _text(self.values[found[1]]), self.phrase.english)
+    def __new__(
+        cls, text: str, key: str = "", values: Mapping[str, Value] | None = None, parts: tuple[str, ...] = ()
+    ) -> Message:
+        """A text with its key and values, or with its parts; see `sentence` and `joined`."""
+        message = super().__new__(cls, text)
+        message.key, message.values, message.parts = key, values or {}, parts
+        return message
 
     def document(self) -> dict[str, Any]:
-        """Key and values, for a page."""
-        return {"key": self.phrase.key, "values": {name: _document(value) for name, value in self.values.items()}}
+        """Key, values and text, for a page."""
+        return {"key": self.key, "values": {name: _document(value) for name, value in self.values.items()}}
 
 
-def recognised(text: str, phrases: Iterable[Phrase]) -> Message | None:
-    """The message that an English text is, by the first phrase that matches all of it; None if none does."""
-    for phrase in phrases:
-        if found := phrase.pattern.fullmatch(text):
-            return Message(phrase, found.groupdict())
-    return None
+def sentence(key: str, **values: Value) -> Message:
+    """The sentence of a key with its values.
+
+    Raises:
+        KeyError: the catalogue has no such sentence, or the sentence has a value that is not given.
+    """
+    texts = {name: ", ".join(value) if isinstance(value, tuple) else value for name, value in values.items()}
+    return Message(CATALOGUE[key].format_map(texts), key, values)
 
 
-def _text(value: Value) -> str:
-    if isinstance(value, tuple):
-        return ", ".join(one.text for one in value)
-    return value.text if isinstance(value, Message) else str(value)
+def joined(texts: Iterable[str]) -> str:
+    """Several sentences as one text, divided by ``; ``; empty sentences are left out."""
+    parts = tuple(text for text in texts if text)
+    return parts[0] if len(parts) == 1 else Message("; ".join(parts), parts=parts)
+
+
+def key_of(text: str) -> str:
+    """The key of a message; empty for any other text."""
+    return text.key if isinstance(text, Message) else ""
+
+
+def messages_of(document: Any) -> dict[str, dict[str, Any]]:
+    """Key and values of all messages in a document of dictionaries and lists, by their texts."""
+    if isinstance(document, Message):
+        return {str(document): document.document()} if document.key else messages_of(document.parts)
+    inside = document.values() if isinstance(document, dict) else document if isinstance(document, list | tuple) else ()
+    return {text: message for value in inside for text, message in messages_of(value).items()}
+
+
+def with_messages(document: dict[str, Any]) -> dict[str, Any]:
+    """A document with the ``messages`` of its texts, if there are any."""
+    messages = messages_of(document)
+    return {**document, "messages": messages} if messages else document
 
 
 def _document(value: Value) -> Any:
     if isinstance(value, tuple):
-        return [one.document() for one in value]
+        return [part.document() for part in value]
     return value.document() if isinstance(value, Message) else value

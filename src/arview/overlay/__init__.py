@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from arview.overlay.evidence import evidence_of as evidence_of
     from arview.overlay.evidence import presence_of as presence_of
     from arview.overlay.labels import MEASURING as MEASURING
+    from arview.overlay.labels import age_text as age_text
     from arview.overlay.labels import arrow_in_model as arrow_in_model
     from arview.overlay.labels import arrow_scale as arrow_scale
     from arview.overlay.labels import by_urgency as by_urgency
@@ -28,7 +29,6 @@ if TYPE_CHECKING:
     from arview.overlay.renderer import OverlayRenderer as OverlayRenderer
     from arview.overlay.renderer import specimen_mark as specimen_mark
     from arview.overlay.renderer import specimen_rgb as specimen_rgb
-    from arview.overlay.status import age_text as age_text
     from arview.overlay.status import completeness_text as completeness_text
 
 __getattr__, __dir__, __all__ = lazy_door(
@@ -41,6 +41,7 @@ __getattr__, __dir__, __all__ = lazy_door(
         ),
         "labels": (
             "MEASURING",
+            "age_text",
             "arrow_in_model",
             "arrow_scale",
             "by_urgency",
@@ -69,9 +70,6 @@ __getattr__, __dir__, __all__ = lazy_door(
             "specimen_mark",
             "specimen_rgb",
         ),
-        "status": (
-            "age_text",
-            "completeness_text",
-        ),
+        "status": ("completeness_text",),
     },
 )

@@ -14,6 +14,7 @@ from functools import cached_property
 
 import numpy as np
 
+from arview.core.messages import Message, sentence
 from arview.geometry import Array, apply
 from arview.inspection import ComponentDeviation, Finding, Inspection, Verdict, decimals_of
 from arview.overlay.evidence import DISPLACED_RGB, MISSING_RGB, DrawnEvidence, dimmed, evidence_of
@@ -23,13 +24,17 @@ from arview.pose import ComponentPresence
 _MM_PER_UNIT = {"mm": 1.0, "inch": 25.4}
 _UNIT_SUFFIX = {"mm": " mm", "inch": " in"}
 _RANK = {Verdict.FAIL: 0, Verdict.UNDECIDED: 1, Verdict.PASS: 2, Verdict.MEASURED: 3, Verdict.NOT_MEASURED: 4}
-CHANGED = "changed since measured"
-UNVERIFIED = "not verified here"
-UNCERTAIN = "evidence here conflicts"
-OCCLUDED = "hidden by something"
-MEASURING = "measuring"
+OCCLUDED = sentence("label.hidden")
+MEASURING = sentence("walk.measuring")
 """What stands in place of a value that is not there yet."""
 _SECONDS_PER_DAY = 86400.0
+_REMARKS = {
+    (DrawnEvidence.UNVERIFIED, True): "label.measured_unverified",
+    (DrawnEvidence.UNVERIFIED, False): "label.not_verified",
+    (DrawnEvidence.UNCERTAIN, True): "label.measured_uncertain",
+    (DrawnEvidence.UNCERTAIN, False): "label.conflicts",
+}
+"""Keys of the remark on a component that the pictures leave open, by its evidence and whether it was measured."""
 _MIN_TURN_DEG = 5.0
 """Rotation of a displaced component below which its label does not tell it."""
 _SAME_PLACE_MM = 2.0
@@ -82,9 +87,9 @@ def label_order(names: Iterable[str], inspection: Inspection | None, pending: Co
 def value_text(deviation: ComponentDeviation) -> str:
     """The distance with its unit, ``missing``, ``undetermined``, or an empty text if nothing was measured."""
     if deviation.finding is Finding.MISSING:
-        return "missing"
+        return sentence("label.was_missing")
     if deviation.distance_mm is None:
-        return "" if deviation.verdict is Verdict.NOT_MEASURED else "undetermined"
+        return "" if deviation.verdict is Verdict.NOT_MEASURED else sentence("label.undetermined")
     return _number(deviation.distance_mm, uncertainty_mm=deviation.uncertainty_mm) + _UNIT_SUFFIX[UNIT]
 
 
@@ -175,6 +180,14 @@ class LabelText:
         return self.evidence.is_refuted or self.verdict in (Verdict.FAIL, Verdict.UNDECIDED)
 
 
+def age_text(age_s: float) -> Message:
+    """Age in the largest unit in which it is at least two (minutes: one), e.g. ``3 h ago``."""
+    for unit, length_s, least in (("days", 86400.0, 2), ("hours", 3600.0, 2), ("minutes", 60.0, 1)):
+        if age_s >= least * length_s:
+            return sentence(f"age.{unit}", count=round(age_s / length_s))
+    return sentence("age.future" if age_s < 0 else "age.now")
+
+
 def inspection_doubt(
     inspection: Inspection, serial: str | None, options: OverlayOptions, now: datetime | None = None
 ) -> str:
@@ -187,11 +200,11 @@ def inspection_doubt(
         now: time from which the age is computed; None: the current time.
     """
     if serial and inspection.serial != serial:
-        return f"measured on {inspection.serial or 'a part without serial'}, not on this one"
+        return sentence("label.measured_on", serial=inspection.serial or "a part without serial")
     if options.max_age_days is not None:
         age_days = inspection.age_s(now) / _SECONDS_PER_DAY
         if age_days > options.max_age_days:
-            return f"measured {age_days:.0f} d ago" if age_days >= 2 else f"measured {24 * age_days:.0f} h ago"
+            return sentence("told.label_age", age=age_text(inspection.age_s(now)))
     return ""
 
 
@@ -222,32 +235,30 @@ def label_text(
     """
     evidence = evidence_of(presence, is_withheld)
     if evidence is DrawnEvidence.WITHHELD:
-        return LabelText(name, "", "WITHHELD", evidence=evidence, is_dimmed=True)
+        return LabelText(name, "", sentence("label.withheld"), evidence=evidence, is_dimmed=True)
+    changed = sentence("label.changed")
     was_missing = deviation is not None and deviation.finding is Finding.MISSING
     was_measured = deviation is not None and deviation.distance_mm is not None
     if evidence is DrawnEvidence.MISSING:
-        notes = _with((), CHANGED if was_measured else "as measured" if was_missing else "")
+        notes = _with((), changed if was_measured else sentence("label.as_measured") if was_missing else "")
         value = MEASURING if is_pending else ""
-        return LabelText(name, value, "MISSING", _with(notes, note), evidence=evidence)
+        return LabelText(name, value, sentence("label.missing"), _with(notes, note), evidence=evidence)
     if evidence is DrawnEvidence.DISPLACED:
         assert presence is not None
         away, turned = displacement_texts(presence, center_in_model, options)
         is_new = was_missing or (was_measured and not _is_as_measured(deviation, presence, center_in_model))
-        notes = _with(turned, CHANGED if is_new else "", note)
-        return LabelText(name, away, "DISPLACED", notes, evidence=evidence)
+        notes = _with(turned, changed if is_new else "", note)
+        return LabelText(name, away, sentence("label.displaced"), notes, evidence=evidence)
     if deviation is None:
-        seen = "" if is_pending else "SEEN"
-        word = {DrawnEvidence.UNVERIFIED: "NOT VERIFIED", DrawnEvidence.UNCERTAIN: "UNCERTAIN"}.get(evidence, seen)
+        word = sentence(f"label.{evidence}") if evidence.is_open or not is_pending else ""
         value = MEASURING if is_pending else ""
         return LabelText(name, value, word, _with((), note), evidence=evidence, is_dimmed=evidence.is_open)
     value, word, verdict = value_text(deviation), VERDICT_WORD[deviation.verdict], deviation.verdict
-    is_measured = verdict is not Verdict.NOT_MEASURED
     remark = ""
     if evidence.is_open:
-        remark = UNVERIFIED if evidence is DrawnEvidence.UNVERIFIED else UNCERTAIN
-        remark = f"measured, {remark}" if is_measured else remark
+        remark = sentence(_REMARKS[evidence, verdict is not Verdict.NOT_MEASURED])
     elif was_missing and presence is not None:
-        remark = f"seen now: {CHANGED}"
+        remark = sentence("label.seen_changed")
     notes = _with((), remark, doubt, note)
     is_dimmed = bool(remark or doubt)
     details = () if notes or verdict is Verdict.PASS else detail_parts(deviation)
@@ -267,8 +278,8 @@ def displacement_texts(
     cosine = min(1.0, max(-1.0, 0.5 * (float(np.trace(moved[:3, :3])) - 1.0)))
     turn_deg = math.degrees(math.acos(cosine))
     digits = (2 if UNIT == "inch" else 1) if distance < 10.0 else (1 if UNIT == "inch" else 0)
-    away = f"≈ {distance / _MM_PER_UNIT[UNIT]:.{digits}f}{_UNIT_SUFFIX[UNIT]} away"
-    return away, (f"turned {turn_deg:.0f}°",) if turn_deg >= _MIN_TURN_DEG else ()
+    away = sentence("label.away", distance=f"{distance / _MM_PER_UNIT[UNIT]:.{digits}f}{_UNIT_SUFFIX[UNIT]}")
+    return away, (sentence("label.turned", angle=f"{turn_deg:.0f}"),) if turn_deg >= _MIN_TURN_DEG else ()
 
 
 def _is_as_measured(

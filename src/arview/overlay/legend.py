@@ -7,6 +7,7 @@ from functools import lru_cache
 
 import numpy as np
 
+from arview.core.messages import sentence
 from arview.overlay import paint
 from arview.overlay.evidence import DIMMED_RGB, DISPLACED_RGB, MISSING_RGB, DrawnEvidence
 from arview.overlay.options import CONTEXT_RGB, Rgb
@@ -15,11 +16,11 @@ from arview.pose import Pose
 _WHITE: Rgb = (240, 244, 248)
 _AMBER: Rgb = (255, 176, 32)
 _ENTRIES: dict[DrawnEvidence, str] = {
-    DrawnEvidence.MISSING: "missing here",
-    DrawnEvidence.DISPLACED: "displaced: CAD place and where it is",
-    DrawnEvidence.UNVERIFIED: "not verified here",
-    DrawnEvidence.UNCERTAIN: "not verified here",
-    DrawnEvidence.WITHHELD: "another specimen: nothing measured is shown",
+    DrawnEvidence.MISSING: sentence("legend.missing"),
+    DrawnEvidence.DISPLACED: sentence("legend.displaced"),
+    DrawnEvidence.UNVERIFIED: sentence("label.not_verified"),
+    DrawnEvidence.UNCERTAIN: sentence("label.not_verified"),
+    DrawnEvidence.WITHHELD: sentence("legend.withheld"),
 }
 
 
@@ -33,7 +34,7 @@ def legend_entries(evidence: Iterable[DrawnEvidence]) -> tuple[tuple[DrawnEviden
 
 def withheld_title(pose: Pose) -> str:
     """Title of the banner of a part whose labels are withheld."""
-    return f"Labels withheld: this is {pose.serial}" if pose.serial else "Labels withheld"
+    return sentence("identity.withheld_of", serial=pose.serial) if pose.serial else sentence("identity.withheld")
 
 
 @lru_cache(maxsize=32)

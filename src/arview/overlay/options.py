@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Literal, get_args
 
+from arview.core.messages import sentence
 from arview.errors import InputError
 from arview.inspection import Verdict
 
@@ -21,11 +22,11 @@ VERDICT_RGB: dict[Verdict, Rgb] = {
     Verdict.NOT_MEASURED: (126, 156, 196),
 }
 VERDICT_WORD: dict[Verdict, str] = {
-    Verdict.PASS: "PASS",
-    Verdict.FAIL: "FAIL",
-    Verdict.UNDECIDED: "UNDECIDED",
-    Verdict.MEASURED: "MEASURED",
-    Verdict.NOT_MEASURED: "NOT MEASURED",
+    Verdict.PASS: sentence("verdict.pass"),
+    Verdict.FAIL: sentence("verdict.fail"),
+    Verdict.UNDECIDED: sentence("verdict.undecided"),
+    Verdict.MEASURED: sentence("verdict.measured"),
+    Verdict.NOT_MEASURED: sentence("verdict.not_measured"),
 }
 NEUTRAL_RGB: Rgb = (70, 196, 255)
 """Colour of ghost and edges without an inspection."""

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from arview.cad import Model
 from arview.camera import Camera
+from arview.core.messages import sentence
 from arview.geometry import Array, apply
 from arview.inspection import ComponentDeviation, Inspection, Verdict
 from arview.overlay import labels, paint
@@ -347,7 +348,7 @@ class PartLayers:
         moved = [apply(other, self._anchors_in_model) - anchors for other in pose.alternatives]
         apart = np.max(np.linalg.norm(moved, axis=2), axis=0) > _SAME_PLACE * self.model.diameter_mm
         count = len(pose.alternatives) + 1
-        note = "one of two places" if count == 2 else f"one of {count} places"
+        note = sentence("label.one_of_two") if count == 2 else sentence("label.one_of", count=count)
         return {int(index): note for index in np.flatnonzero(apart)}
 
     def _draw_banner(self, canvas: paint.Image, pose: Pose) -> None:

@@ -7,9 +7,10 @@ from __future__ import annotations
 
 from datetime import UTC, datetime
 
+from arview.core.messages import sentence
 from arview.inspection import Inspection, Verdict
 from arview.overlay import paint
-from arview.overlay.labels import MEASURING
+from arview.overlay.labels import MEASURING, age_text
 from arview.overlay.options import VERDICT_RGB, VERDICT_WORD, Rgb
 from arview.pose import Completeness, Pose, Presence, TrackingState
 
@@ -30,26 +31,17 @@ _COMPLETENESS_RGB: dict[Completeness, Rgb] = {
     Completeness.INCOMPLETE: VERDICT_RGB[Verdict.FAIL],
     Completeness.NOT_YET_CHECKED: VERDICT_RGB[Verdict.UNDECIDED],
 }
+_COMPLETENESS_KEYS = {Completeness.COMPLETE: "yes", Completeness.INCOMPLETE: "no", Completeness.NOT_YET_CHECKED: "open"}
 _COUNT_ORDER = (Verdict.FAIL, Verdict.UNDECIDED, Verdict.PASS, Verdict.MEASURED, Verdict.NOT_MEASURED)
-
-
-def age_text(age_s: float) -> str:
-    """Age in the largest unit in which it is at least two (minutes: one), e.g. ``3 h ago``."""
-    if age_s < 0:
-        return "in the future"
-    for unit, length_s in (("d", 86400.0), ("h", 3600.0), ("min", 60.0)):
-        if age_s >= 2 * length_s or (unit == "min" and age_s >= length_s):
-            return f"{age_s / length_s:.0f} {unit} ago"
-    return "just now"
 
 
 def completeness_text(pose: Pose) -> str:
     """Whether all components are there, and how many are not: ``INCOMPLETE: 1 missing, 2 displaced``."""
-    word = pose.completeness.upper()
     found = [one.presence for one in pose.components.values()]
-    counts = [(found.count(presence), presence) for presence in (Presence.MISSING, Presence.DISPLACED)]
-    listed = ", ".join(f"{count} {presence}" for count, presence in counts if count)
-    return f"{word}: {listed}" if listed else word
+    counts = {str(presence): found.count(presence) for presence in (Presence.MISSING, Presence.DISPLACED)}
+    listed = {name: count for name, count in counts.items() if count}
+    key = "both" if len(listed) == 2 else next(iter(listed), _COMPLETENESS_KEYS[pose.completeness])
+    return sentence(f"complete.{key}", **listed)
 
 
 class StatusLine:

@@ -9,16 +9,16 @@ from numpy.typing import NDArray
 from arview.cad import Viewpoint, ViewRange
 from arview.cad.viewpoint import viewpoint
 from arview.camera import Camera
+from arview.core.messages import key_of, sentence
 from arview.detection import RejectedHypothesis
 from arview.geometry import Array, apply
 from arview.guideviews import GuideViewSet
 from arview.tracking.estimate import Estimate
 
-NOTHING_IN_VIEW = "nothing like the part in view"
-"""How the reason begins when neither the picture nor a hypothesis explains more."""
-BLURRED = "blurred"
-"""The reason for a picture without sharp edges."""
-
+NOTHING_IN_VIEW = "tracking.nothing_from_to"
+"""Key of the reason when neither the picture nor a hypothesis explains more."""
+BLURRED = "tracking.blurred"
+"""Key of the reason for a picture without sharp edges."""
 
 WIDTH_PX = 640
 """Wider pictures are reduced to this width before light and blur are measured."""
@@ -87,9 +87,10 @@ def diagnose_search(
         reason = outside_range(place, views.view_range, credible.quality >= FITTING_QUALITY)
         reason = reason or _partly_outside(camera, views, credible)
         reason = reason or _low_contrast(image, camera, views, credible.cam_from_model)
-        reason = reason or f"only {100 * credible.evidence.contour_support:.0f} % of the outline found"
+        share = f"{100 * credible.evidence.contour_support:.0f}"
+        reason = reason or sentence("tracking.outline_share", share=share)
     low, high = views.view_range.for_camera(camera, views.diameter_mm).distance_mm
-    return reason or f"{NOTHING_IN_VIEW}, {low:.0f} to {high:.0f} mm away"
+    return reason or sentence(NOTHING_IN_VIEW, low=f"{low:.0f}", high=f"{high:.0f}")
 
 
 def diagnose_picture(image: NDArray[np.uint8]) -> str:
@@ -99,13 +100,13 @@ def diagnose_picture(image: NDArray[np.uint8]) -> str:
     if scale < 1.0:
         gray = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     if float(np.percentile(gray, 95)) < DARK_LEVEL:
-        return "too dark"
+        return sentence("tracking.dark")
     if float(np.percentile(gray, 50)) >= BRIGHT_LEVEL:
-        return "overexposed"
+        return sentence("tracking.bright")
     widths_px = edge_widths_px(np.asarray(gray))
     if np.all(np.isnan(widths_px)):
-        return "low contrast: hardly an edge in the picture"
-    return BLURRED if np.nanmax(widths_px) > MAX_BLUR_PX else ""
+        return sentence("tracking.no_edges")
+    return sentence(BLURRED) if np.nanmax(widths_px) > MAX_BLUR_PX else ""
 
 
 def edge_widths_px(gray: NDArray[np.uint8]) -> Array:
@@ -157,22 +158,21 @@ def outside_range(place: Viewpoint, view_range: ViewRange, is_fitting: bool) -> 
     Direction and roll are only compared when the pose fits, because those of a poor pose are hardly known.
     """
     low, high = view_range.distance_mm
+    distance = f"{place.distance_mm:.0f}"
     if place.distance_mm > high * (1.0 + DISTANCE_MARGIN):
-        return f"too far: about {place.distance_mm:.0f} mm, declared up to {high:.0f} mm"
+        return sentence("tracking.far", distance=distance, limit=f"{high:.0f}")
     if place.distance_mm < low * (1.0 - DISTANCE_MARGIN):
-        return f"too near: about {place.distance_mm:.0f} mm, declared from {low:.0f} mm"
+        return sentence("tracking.near", distance=distance, limit=f"{low:.0f}")
     if not is_fitting:
         return ""
     direction = view_range.direction(place.azimuth_deg, place.elevation_deg)
     if not view_range.contains_direction(direction, ANGLE_MARGIN_DEG):
-        return (
-            f"seen from outside the declared range: azimuth {place.azimuth_deg:.0f}°, "
-            f"elevation {place.elevation_deg:.0f}°"
-        )
+        angles = {"azimuth": f"{place.azimuth_deg:.0f}", "elevation": f"{place.elevation_deg:.0f}"}
+        return sentence("tracking.outside", **angles)
     first, last = view_range.roll_deg
     away = abs((place.roll_deg - 0.5 * (first + last) + 180.0) % 360.0 - 180.0)
     if abs(place.elevation_deg) < POLE_DEG and away > 0.5 * (last - first) + ANGLE_MARGIN_DEG:
-        return f"turned outside the declared range: roll {place.roll_deg:.0f}°, declared {first:.0f} to {last:.0f}°"
+        return sentence("tracking.turned", roll=f"{place.roll_deg:.0f}", first=f"{first:.0f}", last=f"{last:.0f}")
     return ""
 
 
@@ -201,17 +201,17 @@ def diagnose_loss(
     step_px, share = _motion(camera, views, recent) if recent is not None else (np.zeros(2), None)
     in_picture = estimate.evidence.points_in_picture
     if center[2] <= 0 or in_picture < LEFT_SHARE:
-        edge = "" if center[2] <= 0 else f" at the {_edge_of_picture(camera, camera.project(center))[0]} edge"
-        return f"the part left the picture{edge}"
+        edge = "" if center[2] <= 0 else f"_at_{_edge_of_picture(camera, camera.project(center))[0]}"
+        return sentence(f"tracking.left{edge}")
     edge, beyond_px = _edge_of_picture(camera, camera.project(center) + LEAVING_FRAMES * step_px)
     if in_picture < LEAVING_SHARE and beyond_px > 0:
-        return f"the part left the picture at the {edge} edge"
+        return sentence(f"tracking.left_at_{edge}")
     problem = diagnose_picture(image)
-    if problem == BLURRED or (share is not None and share > MAX_MOTION):
-        return "the part moved too fast"
+    if key_of(problem) == BLURRED or (share is not None and share > MAX_MOTION):
+        return sentence("tracking.fast")
     if problem:
         return problem
-    return "the part is hidden or moved too fast"
+    return sentence("tracking.hidden")
 
 
 def _motion(camera: Camera, views: GuideViewSet, recent: tuple[Array, Array]) -> tuple[Array, float]:
@@ -241,7 +241,7 @@ def _too_small(camera: Camera, views: GuideViewSet, rejected: RejectedHypothesis
     if rejected is not None:
         distance_mm = max(float(np.linalg.norm(apply(rejected.cam_from_model, views.center_in_model))), low)
     span_px = _span_px(camera, views, distance_mm)
-    return f"too far: the part spans only {span_px:.0f} px" if span_px < MIN_SPAN_PX else ""
+    return sentence("tracking.small", span=f"{span_px:.0f}") if span_px < MIN_SPAN_PX else ""
 
 
 def _partly_outside(camera: Camera, views: GuideViewSet, rejected: RejectedHypothesis) -> str:
@@ -250,9 +250,9 @@ def _partly_outside(camera: Camera, views: GuideViewSet, rejected: RejectedHypot
     if rejected.evidence.points_in_picture > CUT_OFF_SHARE or center[2] <= 0:
         return ""
     if _span_px(camera, views, float(center[2])) > OVERFLOW * max(camera.width, camera.height):
-        return "too near: the part does not fit in the picture"
+        return sentence("tracking.large")
     edge, _ = _edge_of_picture(camera, camera.project(center))
-    return f"partly outside the picture at the {edge} edge"
+    return sentence(f"tracking.partly_{edge}")
 
 
 def _low_contrast(image: NDArray[np.uint8], camera: Camera, views: GuideViewSet, cam_from_model: Array) -> str:
@@ -272,4 +272,4 @@ def _low_contrast(image: NDArray[np.uint8], camera: Camera, views: GuideViewSet,
     (u, v), (x, y) = inside[is_seen].astype(np.intp).T, outside[is_seen].astype(np.intp).T
     smooth = cv2.blur(image, (3, 3)).astype(np.float64)
     difference = float(np.median(np.abs(smooth[v, u] - smooth[y, x]).max(axis=1)))
-    return "low contrast of the part against its background" if difference < MIN_CONTRAST else ""
+    return sentence("tracking.contrast") if difference < MIN_CONTRAST else ""

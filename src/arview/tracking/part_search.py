@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from arview.assembly import AssemblyMonitor
 from arview.cad import Model
 from arview.camera import Camera
+from arview.core.messages import joined, key_of, sentence
 from arview.core.parallel import single_threaded_blas
 from arview.detection import Detection, Detector, LocalSearch, RejectedHypothesis, local_search_for
 from arview.geometry import Array, apply, are_near, check_rigid
@@ -50,7 +51,7 @@ ALIGN_ADVICE_EVERY = 10
 DISTANCE_MARGIN = 2.0
 """Factor by which a pose may be nearer or farther than the declared range."""
 
-ALIGN = "align the part with the outline"
+ALIGN = sentence("tracking.align")
 """Reason given while the session waits for the part at its guide pose."""
 
 
@@ -243,8 +244,8 @@ class PartSearch:
         reason = diagnose_search(image, self._camera, self._views, rejected)
         if state.state != TrackingState.LOST:
             return reason
-        reason = state.loss_reason if reason.startswith(NOTHING_IN_VIEW) else reason
-        return reason if self.guide_pose(state) is None else f"{reason}; {ALIGN}"
+        reason = state.loss_reason if key_of(reason) == NOTHING_IN_VIEW else reason
+        return reason if self.guide_pose(state) is None else joined((reason, ALIGN))
 
     @property
     def _guided(self) -> GuidedInit:

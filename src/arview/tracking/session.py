@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from arview.cad import Model
 from arview.camera import Camera
+from arview.core.messages import sentence
 from arview.errors import InputError
 from arview.fiducials import SerialNumbers
 from arview.geometry import Array
@@ -244,7 +245,7 @@ class TrackingSession:
     def _waiting(self, number: int, index: int, time_s: float) -> Pose:
         """Result of a specimen that is not searched for in this frame, because another one is."""
         last = self._poses.get(number)
-        reason = "another part is searched for first" if last is None else last.reason
+        reason = sentence("tracking.other_first") if last is None else last.reason
         state, name = self.specimens[number].state, self._parts[number].name
         return Pose(None, None, 0.0, state, time_s, index, reason=reason, instance=name)
 

@@ -17,6 +17,7 @@ from arview.assembly import AssemblyMonitor, Turn
 from arview.cad import Model
 from arview.camera import Camera, FrameView
 from arview.core.checks import check_type
+from arview.core.messages import joined, sentence
 from arview.detection import RejectedHypothesis
 from arview.errors import MismatchError
 from arview.fiducials import SerialNumbers
@@ -359,10 +360,11 @@ class SpecimenTracking:
         self.tracker.expect(self.components.lines(self._part, pose, base_part))
         reasons = [text for text in (reason, *self.components.mismatches) if text]
         if self.components.uncertain and not reasons:
-            reasons = [f"in doubt: {', '.join(self.components.uncertain)}"]
-        if reasons:
-            s.apply(Event.CONTRADICTED)
-        return "; ".join(reasons)
+            reasons = [sentence("tracking.in_doubt", names=", ".join(self.components.uncertain))]
+        if not reasons:
+            return ""
+        s.apply(Event.CONTRADICTED)
+        return joined(reasons)
 
     def _remember(self, image: NDArray[np.uint8], estimate: Estimate) -> None:
         """Remember pose and appearance of a part that is tracked without doubt."""

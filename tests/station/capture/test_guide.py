@@ -13,10 +13,11 @@ from arview.cad.part import ComponentSettings, Part
 from arview.cad.view_range import ViewRange
 from arview.cad.viewpoint import Viewpoint, pose_at
 from arview.camera import Camera
+from arview.core.messages import sentence
 from arview.errors import InputError
 from arview.geometry import Array, exp_so3, rigid
 from arview.pose import Identity, Pose, TrackingState
-from arview.station.capture import CaptureAdvice, CaptureGuide, CaptureOptions, capture_document, words
+from arview.station.capture import CaptureAdvice, CaptureGuide, CaptureOptions, capture_document
 from arview.station.capture.information import expected_error
 from arview.station.capture.options import MAX_STEP_DEG
 from helpers.cad_files import box
@@ -101,10 +102,10 @@ def test_a_still_sharp_new_view_is_taken_once(walk: Walk) -> None:
     assert advice.takes and advice.take_id == 1 and advice.reason == ""
     # It is asked for until it is reported, and not again under another number.
     again = walk.frame(at(0, 35), TEXTURE)
-    assert again.takes and again.take_id == 1 and again.reason == words.TAKING.english
+    assert again.takes and again.take_id == 1 and again.reason == sentence("capture.taking")
     walk.guide.photo_taken(at(0, 35))
     after = walk.stay(at(0, 35), image=TEXTURE)
-    assert not after.takes and after.reason == words.ALREADY_TAKEN.english and after.photos == 1
+    assert not after.takes and after.reason == sentence("capture.already_taken") and after.photos == 1
     # Not from a place beside it either, whatever its distance and roll.
     assert not walk.stay(at(6, 37, 460.0, 30.0), image=TEXTURE).takes
     assert walk.stay(at(25, 35), image=TEXTURE).take_id == 2
@@ -115,13 +116,13 @@ def test_nothing_is_taken_while_the_camera_moves(walk: Walk) -> None:
     for index in range(100):  # 40° a second
         advice = walk.frame(at(2.0 * index, 35), TEXTURE)
         assert not advice.takes
-    assert advice.reason == words.HOLD_STILL.english
+    assert advice.reason == sentence("capture.hold_still")
     assert walk.stay(at(2.0 * 99, 35), image=TEXTURE).takes
 
 
 def test_nothing_is_taken_while_the_gyroscope_turns(walk: Walk) -> None:
     advice = walk.stay(at(0, 35), image=TEXTURE, gyro=0.6)
-    assert not advice.takes and advice.reason == words.HOLD_STILL.english
+    assert not advice.takes and advice.reason == sentence("capture.hold_still")
     assert walk.stay(at(0, 35), image=TEXTURE, gyro=0.03).takes
 
 
@@ -129,7 +130,7 @@ def test_nothing_is_taken_while_the_picture_is_blurred(walk: Walk) -> None:
     for _ in range(3):
         walk.frame(at(0, 35), TEXTURE)
     advice = walk.stay(at(0, 35), frames=8, image=SOFT)
-    assert not advice.takes and advice.reason == words.NOT_SHARP.english
+    assert not advice.takes and advice.reason == sentence("capture.not_sharp")
     assert walk.stay(at(0, 35), image=TEXTURE).takes
 
 
@@ -138,17 +139,17 @@ def test_a_stream_that_was_sharp_is_not_taken_out_of_focus(walk: Walk) -> None:
     assert walk.stay(at(0, 35), image=TEXTURE).takes
     walk.guide.photo_taken(at(0, 35))
     advice = walk.stay(at(30, 35), frames=80, image=SOFT)  # longer than sharpness is remembered
-    assert not advice.takes and advice.reason in (words.NOT_SHARP.english, words.OUT_OF_FOCUS.english)
-    assert advice.reason == words.OUT_OF_FOCUS.english
+    assert not advice.takes and advice.reason in (sentence("capture.not_sharp"), sentence("capture.out_of_focus"))
+    assert advice.reason == sentence("capture.out_of_focus")
 
 
 @pytest.mark.parametrize(
     ("changes", "reason"),
     [
-        ({"state": TrackingState.CRITICAL}, words.UNCERTAIN.english),
-        ({"quality": 0.3}, words.NOT_TRACKED.english),
-        ({"identity": Identity.UNCONFIRMED}, words.OTHER_SPECIMEN.english),
-        ({"alternatives": (np.eye(4),)}, words.AMBIGUOUS.english),
+        ({"state": TrackingState.CRITICAL}, sentence("capture.uncertain")),
+        ({"quality": 0.3}, sentence("capture.not_tracked")),
+        ({"identity": Identity.UNCONFIRMED}, sentence("capture.other_specimen")),
+        ({"alternatives": (np.eye(4),)}, sentence("capture.ambiguous")),
     ],
 )
 def test_nothing_is_taken_of_an_uncertain_pose(walk: Walk, changes: dict[str, object], reason: str) -> None:
@@ -160,9 +161,9 @@ def test_nothing_is_taken_of_an_uncertain_pose(walk: Walk, changes: dict[str, ob
 def test_nothing_is_taken_of_a_lost_part(walk: Walk) -> None:
     for _ in range(30):
         advice = walk.frame(None, TEXTURE)
-    assert not advice.takes and advice.reason == words.NOT_TRACKED.english and advice.text == "20 more photos"
+    assert not advice.takes and advice.reason == sentence("capture.not_tracked") and advice.text == "20 more photos"
     first = walk.frame(at(0, 35), TEXTURE)
-    assert not first.takes and first.reason == words.HOLD_STILL.english  # its motion is not known yet
+    assert not first.takes and first.reason == sentence("capture.hold_still")  # its motion is not known yet
 
 
 def test_quality_has_a_hysteresis(walk: Walk) -> None:
@@ -177,12 +178,12 @@ def test_distance_and_picture(walk: Walk) -> None:
     near, far = walk.guide.dome.distance_mm
     assert 300.0 <= near < far <= 600.0
     advice = walk.stay(at(0, 35, 590.0 + 200.0))
-    assert (advice.takes, advice.distance, advice.reason) == (False, "far", words.CLOSER.english)
+    assert (advice.takes, advice.distance, advice.reason) == (False, "far", sentence("capture.closer"))
     advice = walk.stay(at(0, 35, 0.8 * near))
-    assert (advice.takes, advice.distance, advice.reason) == (False, "near", words.FARTHER.english)
+    assert (advice.takes, advice.distance, advice.reason) == (False, "near", sentence("capture.farther"))
     aside = rigid(exp_so3([0.0, 0.45, 0.0]), np.zeros(3)) @ at(0, 35)
     advice = walk.stay(aside)
-    assert (advice.takes, advice.distance, advice.reason) == (False, "good", words.NOT_INSIDE.english)
+    assert (advice.takes, advice.distance, advice.reason) == (False, "good", sentence("capture.not_inside"))
     assert walk.stay(at(0, 35)).takes
 
 

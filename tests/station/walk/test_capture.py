@@ -20,11 +20,11 @@ from arview.cad.viewpoint import Viewpoint, pose_at
 from arview.camera import Camera
 from arview.camera.exif import focal_length_px, read_exif
 from arview.core import atomic
+from arview.core.messages import sentence
 from arview.errors import OutputError
 from arview.geometry import Array
 from arview.pose import Pose, TrackingState
 from arview.reconstruction.intake.reading import photo_paths
-from arview.station.capture import words
 from arview.station.walk.capture import capture_options, capture_photos, open_folder, summary_lines
 from arview.video import Frame, FrameSource
 from arview.video.pictures import PictureSource
@@ -133,7 +133,7 @@ def test_nothing_is_taken_while_the_part_is_lost(tmp_path: Path) -> None:
     assert len(taken) > 5
     for pose in taken:
         assert not any(np.allclose(walk.poses[index], pose) for index in lost)
-    assert summary.reasons[words.NOT_TRACKED.english] == len(lost)
+    assert summary.reasons[sentence("capture.not_tracked")] == len(lost)
     assert not (tmp_path / "out" / "job.json").exists()
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from arview.core.messages import Message
+from arview.core.messages import with_messages
 
 RingDistance = Literal["near", "good", "far"]
 """Distance of the camera: nearer than the ring of good distances, on it, or farther."""
@@ -37,7 +37,7 @@ class ComponentNeed:
         directions: of these that differ.
         predicted_u_mm: expanded uncertainty (k = 2) to be expected from them; None with fewer than two.
         is_enough: whether nothing more is asked for.
-        lacking: what is lacking, if anything.
+        text: what is lacking, or empty.
     """
 
     name: str
@@ -45,12 +45,7 @@ class ComponentNeed:
     directions: int
     predicted_u_mm: float | None
     is_enough: bool
-    lacking: Message | None = None
-
-    @property
-    def text(self) -> str:
-        """What is lacking, in English, or empty."""
-        return "" if self.lacking is None else self.lacking.text
+    text: str = ""
 
 
 @dataclass(frozen=True)
@@ -60,8 +55,8 @@ class CaptureAdvice:
     Attributes:
         takes: take a photo now; stays true until the photo is reported as taken or failed.
         take_id: grows with each photo that is asked for, so that none is taken twice.
-        way: where to go next.
-        obstacle: why no photo is taken at this frame; None when one is.
+        text: where to go next.
+        reason: why no photo is taken at this frame; empty when one is.
         progress: 0–1.
         is_enough: whether the photos suffice.
         photos: taken so far.
@@ -73,8 +68,8 @@ class CaptureAdvice:
 
     takes: bool
     take_id: int
-    way: Message
-    obstacle: Message | None
+    text: str
+    reason: str
     progress: float
     is_enough: bool
     photos: int
@@ -82,22 +77,6 @@ class CaptureAdvice:
     distance: RingDistance
     components: tuple[ComponentNeed, ...]
     revision: int = 0
-
-    @property
-    def text(self) -> str:
-        """Where to go next, in English."""
-        return self.way.text
-
-    @property
-    def reason(self) -> str:
-        """Why no photo is taken at this frame, in English; empty when one is."""
-        return "" if self.obstacle is None else self.obstacle.text
-
-    def messages(self, has_components: bool = True) -> dict[str, dict[str, Any]]:
-        """Key and values of each text, by the text, for pages in other languages."""
-        needs = [one.lacking for one in self.components] if has_components else []
-        said = [one for one in (self.way, self.obstacle, *needs) if one is not None]
-        return {one.text: one.document() for one in said}
 
 
 def capture_document(advice: CaptureAdvice, job: str = "", has_components: bool = True) -> dict[str, Any]:
@@ -131,5 +110,4 @@ def capture_document(advice: CaptureAdvice, job: str = "", has_components: bool 
             }
             for index, one in enumerate(advice.components)
         ]
-    document["messages"] = advice.messages(has_components)
-    return document
+    return with_messages(document)

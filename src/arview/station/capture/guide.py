@@ -12,7 +12,7 @@ from arview import reconstruction
 from arview.cad import Part
 from arview.camera import Camera
 from arview.core.checks import check_type
-from arview.core.messages import Message
+from arview.core.messages import Message, sentence
 from arview.geometry import Array, apply, check_rigid
 from arview.pose import Pose, TrackingState
 from arview.station.capture import words
@@ -106,7 +106,7 @@ class CaptureGuide:
         if self._asked is not None and not 0.0 <= time_s - self._asked[0] <= PENDING_S:
             self.photo_failed()
         obstacle = self._obstacle(pose, image_rgb, time_s, gyro_rad_s)
-        if obstacle is None and pose.cam_from_model is not None:
+        if not obstacle and pose.cam_from_model is not None:
             self._take_id += 1
             self._asked = time_s, pose.cam_from_model
         takes = self._asked is not None
@@ -114,8 +114,8 @@ class CaptureGuide:
         return CaptureAdvice(
             takes=takes,
             take_id=self._take_id,
-            way=self._way(here),
-            obstacle=obstacle,
+            text=self._way(here),
+            reason=obstacle,
             progress=self.needs.progress,
             is_enough=self.needs.is_enough,
             photos=self.needs.photos,
@@ -147,44 +147,48 @@ class CaptureGuide:
 
     def _obstacle(
         self, pose: Pose, image_rgb: NDArray[np.uint8] | None, time_s: float, gyro_rad_s: float | None
-    ) -> Message | None:
-        """Why no photo is to be taken at this frame; None if nothing stands against it."""
+    ) -> str:
+        """Why no photo is to be taken at this frame; empty if nothing stands against it."""
         trigger = self.options.trigger
         here = pose.cam_from_model
         is_certain = self._quality.update(pose.quality if here is not None else 0.0)
         if here is None:
             self._motion.forget()
-            return words.NOT_TRACKED()
+            return sentence("capture.not_tracked")
         is_still = self._motion.update(here, time_s, gyro_rad_s)
         self._distance = self._ring_distance(here)
         pixels = self._camera.project(apply(here, self._corners))
         gray = None if image_rgb is None else middle_of_part(image_rgb, pixels, FOCUS_PX)
         is_sharp = gray is None or self._focus.update(gray, time_s)
         if self._asked is not None:
-            return words.TAKING()
+            return sentence("capture.taking")
         if self.needs.is_enough:
-            return words.ENOUGH()
+            return sentence("capture.enough")
         if pose.state is not TrackingState.TRACKED or not is_certain:
-            return words.NOT_TRACKED() if pose.state is not TrackingState.CRITICAL else words.UNCERTAIN()
+            return (
+                sentence("capture.not_tracked")
+                if pose.state is not TrackingState.CRITICAL
+                else sentence("capture.uncertain")
+            )
         if pose.is_label_withheld:
-            return words.OTHER_SPECIMEN()
+            return sentence("capture.other_specimen")
         if pose.alternatives:
-            return words.AMBIGUOUS()
+            return sentence("capture.ambiguous")
         if self._distance != "good":
-            return words.CLOSER() if self._distance == "far" else words.FARTHER()
+            return sentence("capture.closer") if self._distance == "far" else sentence("capture.farther")
         if self._inside_share(pixels) < MIN_INSIDE:
-            return words.NOT_INSIDE()
+            return sentence("capture.not_inside")
         if self.needs.nearest_deg(self._direction(here)) < self.needs.apart_deg:
-            return words.ALREADY_TAKEN()
+            return sentence("capture.already_taken")
         if not self._gains_enough(here, time_s):
-            return words.LITTLE_GAIN()
+            return sentence("capture.little_gain")
         if not is_still:
-            return words.HOLD_STILL()
+            return sentence("capture.hold_still")
         if not is_sharp:
-            return words.NOT_SHARP()
+            return sentence("capture.not_sharp")
         if self._last_s is not None and 0.0 <= time_s - self._last_s < trigger.min_interval_s:
-            return words.TOO_SOON()
-        return None if gray is None or self._focus.is_in_focus(gray) else words.OUT_OF_FOCUS()
+            return sentence("capture.too_soon")
+        return "" if gray is None or self._focus.is_in_focus(gray) else sentence("capture.out_of_focus")
 
     def _gains_enough(self, cam_from_model: Array, time_s: float) -> bool:
         """Whether a photo from here lowers U nearly as much as one from the best direction.
@@ -226,7 +230,7 @@ class CaptureGuide:
     def _way(self, here: Array | None) -> Message:
         """Where to go next."""
         if self.needs.is_enough:
-            return words.ENOUGH_OF(count=self.needs.photos)
+            return sentence("capture.enough_of", count=self.needs.photos)
         plan = self.needs.plan
         if here is None:
             return words.more_message(len(plan), ())
@@ -235,7 +239,7 @@ class CaptureGuide:
         sides = [words.side_of(here, eye, self._center) for eye in eyes]
         more = words.more_message(len(plan), sides)
         hidden = words.hidden_message(self.needs.hidden_from(self._cell(here)))
-        return more if hidden is None else words.BOTH(first=more, second=hidden)
+        return more if hidden is None else sentence("capture.both", first=more, second=hidden)
 
     def _cell_states(self) -> tuple[CellState, ...]:
         """The cells of the dome, made anew when something has changed."""

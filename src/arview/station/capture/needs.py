@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from arview import reconstruction
 from arview.cad import Part
 from arview.camera import Camera
+from arview.core.messages import sentence
 from arview.geometry import Array, apply
 from arview.station.capture import words
 from arview.station.capture.advice import ComponentNeed
@@ -136,9 +137,9 @@ class CaptureNeeds:
     def _row(self, index: int, cell: int | None) -> ComponentNeed:
         u_mm, is_enough, can_be_seen = self._state
         photos, directions = self._counts(index, self._known.views)
-        lacking = None
+        lacking = ""
         if self._is_asked[index] and not can_be_seen[index]:
-            lacking = words.NEVER_SEEN()
+            lacking = sentence("capture.never_seen")
         elif self._is_asked[index] and not is_enough[index]:
             is_hidden = cell is not None and not self._dome.is_seen[cell, index]
             lacking = words.lacking_message(reconstruction.PHOTOS_WANTED - photos, is_hidden)

@@ -140,10 +140,10 @@ Join::
      "replaces": CLIENT}      offer: with webrtc only; replaces: an earlier client of this page, which then leaves
 
 **Texts.** All texts are English. *Pose*, *Status*, *Part*, *Job* and ``capture`` have ``"messages": {text: {"key",
-"values": {name: text, number, {"key", "values"} or a list of those}}}`` for those of their texts that are in the
-catalogue (`arview.station.live.stream.phrases`, `arview.station.capture.words`), so that a page can say them in its own
-language; of a text of several sentences with ``; `` between them, each is looked up by itself where the whole is not
-there. Errors and notices without one have their code.
+"values": {name: text, number, {"key", "values"} or a list of those}}}`` for those of their texts that are sentences of
+the catalogue (`arview.core.messages`), so that a page can say them in its own language; of a text of several sentences
+with ``; `` between them, each is looked up by itself where the whole is not there. Errors and notices without one have
+their code.
 
 Pose::
 

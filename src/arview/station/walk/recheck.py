@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from arview import measurement, reconstruction, workflow
 from arview.cad import Part
 from arview.camera import Camera
+from arview.core.messages import sentence
 from arview.core.stage_cache import write_json
 from arview.errors import ArviewError, CannotMeasureError, InputError
 from arview.geometry import Array
@@ -53,7 +54,7 @@ class RecheckWorker(WalkWorker):
         """Make the earlier photos ready, which needs none of the new ones."""
         if self.state.stage == "done":
             return prepared_of(self.first)
-        self._say(text="reading the first measurement")
+        self._say(text=sentence("walk.first"))
         prepared = prepared_of(self.first)
         measurement.check_not_datums(prepared.part, self.job.components or ())
         self.scale, whole, photos = read_first(self.first)
@@ -85,7 +86,7 @@ class RecheckWorker(WalkWorker):
             return
         self.job.remove_unconfirmed()
         photos = self.job.photos()
-        self._say(stage="measuring", text="measuring", photos=len(photos))
+        self._say(stage="measuring", text=sentence("walk.measuring"), photos=len(photos))
         assert self.earlier is not None
         prefix = f"recheck/{self.job.path.name}/photos/"
         options = replace(prepared.reconstruct, last_stage="photos")

@@ -11,6 +11,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
+from arview.core.messages import sentence, with_messages
 from arview.errors import InputError
 from arview.geometry import Array
 
@@ -67,7 +68,7 @@ class WalkState:
     """
 
     stage: WalkStage = "collecting"
-    text: str = "waiting for photos"
+    text: str = sentence("walk.waiting")
     photos: int = 0
     placed: int = 0
     step: str = ""
@@ -81,7 +82,7 @@ class WalkState:
 
     def document(self) -> dict[str, Any]:
         """The state for ``state.json``."""
-        return asdict(self)
+        return with_messages(asdict(self))
 
     @staticmethod
     def of_document(document: Any) -> WalkState:
@@ -92,7 +93,8 @@ class WalkState:
         given = {key: value for key, value in document.items() if key in known}
         if given.get("stage") not in get_args(WalkStage) or given.get("cloud", "waiting") not in get_args(CloudState):
             raise InputError("is no state of a job")
-        return WalkState(**given)
+        said = document.get("messages", {}).get(given.get("text"))
+        return WalkState(**{**given, "text": sentence(said["key"], **said["values"])} if said else given)
 
 
 def photo_of_line(document: Any) -> StoredPhoto:

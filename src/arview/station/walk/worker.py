@@ -16,6 +16,7 @@ from typing import Any
 
 from arview import reconstruction, workflow
 from arview.cad import Part
+from arview.core.messages import sentence
 from arview.core.progress import Progress
 from arview.errors import ArviewError, InputError, MismatchError
 from arview.inspection import Inspection, save_inspection, verdict_sentence
@@ -76,12 +77,12 @@ class WalkWorker:
             kept = None if path is None else path.relative_to(self.job.path).as_posix()
             is_rough = kept is not None and kept != "inspection.json"
             self.state = WalkState(photos=len(self.job.photos()), is_rough=is_rough, inspection=kept)
-            self._say(text="starting")
+            self._say(text=sentence("walk.starting"))
 
     def _wait_for_first_photo(self) -> workflow.Prepared:
         """The inputs of the measurement, which can be checked from the first photo on."""
         if self.state.stage == "collecting":
-            self._say(text="waiting for photos")
+            self._say(text=sentence("walk.waiting"))
         while not self.job.photos():
             if self.job.is_ended:
                 raise InputError(f"job {self.job.id}: the walk ended without a photo; reopen it and take some")
@@ -97,7 +98,7 @@ class WalkWorker:
             while not self.job.is_ended:
                 photos = len(self.job.photos())
                 if photos != self.state.photos:
-                    self._say(photos=photos, text=f"{photos} photos")
+                    self._say(photos=photos, text=sentence("walk.photos", count=photos))
                 if preparation.ready >= wanted:
                     count = preparation.ready
                     is_measured = self._measure_roughly(prepared, count)
@@ -143,7 +144,7 @@ class WalkWorker:
             placed=placed,
             is_rough=True,
             inspection="rough/inspection.json",
-            text=f"{len(self.job.photos())} photos; provisional numbers from {count}",
+            text=sentence("walk.provisional", count=len(self.job.photos()), placed=count),
         )
         return True
 
@@ -167,7 +168,7 @@ class WalkWorker:
                 self._report(prepared.part)  # without the cloud, so that there is one to decide and sign in
 
         if not was_done:
-            self._say(stage="measuring", text="measuring", photos=len(photos), cloud="waiting")
+            self._say(stage="measuring", text=sentence("walk.measuring"), photos=len(photos), cloud="waiting")
         try:
             outcome = workflow.inspect_prepared(
                 prepared, self.job.path, progress=self._progress(), memory=self.memory, on_verdict=on_verdict

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from arview.core.messages import sentence
 from arview.geometry import Array
 from arview.tracking.identity.followed_place import FollowedPlace, KeptView, Placement
 from arview.tracking.identity.part_outline import PartOutline
@@ -25,8 +26,8 @@ MIN_ROOM = 0.7
 RETURN_EVERY_S = 0.35
 """Time between two checks whether the followed part is seen at its old place again."""
 
-ANOTHER_IN_VIEW = "another part of this kind is in view; confirm that this is the one"
-MOVED = "this part is not where the last one was; confirm that this is the one"
+ANOTHER_IN_VIEW = sentence("identity.another")
+MOVED = sentence("identity.moved")
 
 
 @dataclass

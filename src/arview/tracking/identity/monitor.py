@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arview.camera import Camera
+from arview.core.messages import sentence
 from arview.errors import InputError
 from arview.fiducials import SerialCodeReader, SerialNumbers
 from arview.geometry import Array
@@ -32,7 +33,7 @@ MIN_QUALITY = 0.5
 RETURN_S = 10.0
 """Time after the doubt arose for which the old place is followed."""
 
-CHECKING = "checking that this is the part that was followed before"
+CHECKING = sentence("identity.checking")
 
 
 @dataclass(frozen=True)
@@ -218,7 +219,7 @@ class IdentityMonitor:
             self.confirm()
             return other
         self._place.release()
-        reason = f"no part of this kind found at {pixel[0]:g},{pixel[1]:g} in frame {first}; confirm the part"
+        reason = sentence("identity.not_found", place=f"{pixel[0]:g},{pixel[1]:g}", frame=first)
         self._doubt = Doubt(math.inf, math.inf, reason=reason)
         return None
 
@@ -240,13 +241,13 @@ class IdentityMonitor:
         if serial == serials.serial:
             self._settle(Identity.CONFIRMED)
         elif serials.serial:
-            reason = f"the code on this part says {serial}, the inspection is of {serials.serial}"
+            reason = sentence("identity.code", serial=serial, inspected=str(serials.serial))
             self._settle(Identity.OTHER, reason)
 
     def _result(self, moved_to: Array | None) -> IdentityResult:
         if self._named_at is not None:
             index, (x, y) = self._named_at
-            reason = f"the labels belong to the part at {x:g},{y:g} in frame {index}"
+            reason = sentence("identity.belongs", place=f"{x:g},{y:g}", frame=index)
             return IdentityResult(Identity.UNCONFIRMED, reason, self._serial, moved_to)
         if self._doubt is not None:
             return IdentityResult(Identity.UNCONFIRMED, self._doubt.reason or CHECKING, self._serial, moved_to)

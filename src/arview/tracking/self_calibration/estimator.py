@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arview.camera import Camera
+from arview.core.messages import sentence
 from arview.geometry import Array
 from arview.pose import Pose
 from arview.refinement import PartView
@@ -61,13 +62,9 @@ class FocalEstimate:
     def text(self) -> str:
         """The estimate in one line, with expanded uncertainty (k = 2)."""
         if not self.is_determined:
-            return (
-                f"focal length not determined by these views: the guess of {self.guessed_px:.0f} px is kept; "
-                "show the part from near and from several sides"
-            )
-        return (
-            f"focal length estimated: {self.focal_px:.0f} ± {2.0 * self.std_px:.0f} px (guessed {self.guessed_px:.0f})"
-        )
+            return sentence("told.focal_open", guessed=f"{self.guessed_px:.0f}")
+        u_px = f"{2.0 * self.std_px:.0f}"
+        return sentence("told.focal", focal=f"{self.focal_px:.0f}", u=u_px, guessed=f"{self.guessed_px:.0f}")
 
 
 class FocalEstimator:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from arview.cad import Part
+from arview.core.messages import sentence
 from arview.pose import Identity, Pose
 from arview.station import walk
 from arview.station.live.jobs.board import JobBoard
@@ -94,7 +95,7 @@ class JobView:
         """The pose; where a code in the picture names another specimen than the job, nothing measured is shown."""
         if not pose.serial or pose.serial == self.job.serial or pose.identity is Identity.OTHER:
             return pose
-        reason = f"the code on this part says {pose.serial}, the inspection is of {self.job.serial}"
+        reason = sentence("identity.code", serial=pose.serial, inspected=self.job.serial)
         return replace(pose, identity=Identity.OTHER, identity_reason=reason)
 
 

@@ -7,6 +7,7 @@ from dataclasses import asdict
 from typing import Any
 
 from arview import overlay
+from arview.core.messages import with_messages
 from arview.errors import ArviewError
 from arview.inspection import Inspection, Verdict, overall_verdict, verdict_sentence
 from arview.quality import decisions
@@ -16,7 +17,6 @@ from arview.station.live.jobs.board import JobBoard
 from arview.station.live.jobs.desk import JobDesk
 from arview.station.live.jobs.subject import is_open
 from arview.station.live.stream.documents import Document
-from arview.station.live.stream.phrases import messages_of, texts_of
 from arview.station.walk.merged import merged
 
 logger = logging.getLogger("arview.station.live")
@@ -45,7 +45,7 @@ def job_document(job: walk.JobFolder, desk: JobDesk) -> Document:
     board, number = desk.board, desk.part_of(job)
     inspection = board.inspection(job)
     document = {key: value for key, value in job.document.items() if key not in ("format", "version", "part")}
-    told = {
+    told: Document = {
         **document,
         "part": number,
         "state": job.state().document(),
@@ -63,8 +63,7 @@ def job_document(job: walk.JobFolder, desk: JobDesk) -> Document:
         "rechecks": [one.id for one in job.rechecks()],
         "before_after": _before_after(job),
     }
-    messages = messages_of(texts_of({name: told[name] for name in ("state", "inspection", "rework")}))
-    return {**told, "messages": messages} if messages else told
+    return with_messages(told)
 
 
 def rework(job: walk.JobFolder, desk: JobDesk) -> list[Document]:

@@ -6,6 +6,7 @@ import itertools
 import logging
 from dataclasses import replace
 
+from arview.core.messages import sentence
 from arview.errors import ArviewError
 from arview.inspection import ComponentDeviation, Finding, Inspection
 from arview.station import walk
@@ -72,7 +73,7 @@ class JobSubject(Subject):
         if state.stage == "failed":
             notices.append(Notice("job_failed", "error", f"not measured: {state.text}"))
         if shown is not None and state.is_rough:
-            notices.append(Notice("inspection_rough", "info", "first numbers: they are provisional"))
+            notices.append(Notice("inspection_rough", "info", sentence("told.inspection_rough")))
         if shown is not None and state.stage == "done":
             notices += age_notices(shown, self.options.max_age_s)
         return notices

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, get_args
 
+from arview.core.messages import with_messages
 from arview.errors import InputError
 from arview.station.live.jobs.desk import Binding
 from arview.station.live.protocol import FRAME_IDS, Transport, ViewMode
@@ -17,7 +18,6 @@ from arview.station.live.stream.annotator import AnnotatedFrame, FrameAnnotator,
 from arview.station.live.stream.documents import Document, pose_document
 from arview.station.live.stream.feed import Feed, TrackedFrame
 from arview.station.live.stream.newest import AsyncNewestSlot
-from arview.station.live.stream.phrases import with_messages
 from arview.station.live.stream.subject import OverlayStyle
 from arview.station.live.transport.webrtc import Connection
 

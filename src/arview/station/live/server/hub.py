@@ -11,6 +11,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from arview.core.messages import sentence, with_messages
 from arview.errors import ArviewError, InputError
 from arview.station.live.jobs.desk import Binding, JobDesk, JobView
 from arview.station.live.options import LiveOptions
@@ -32,7 +33,6 @@ from arview.station.live.stream.documents import (
 )
 from arview.station.live.stream.feed import Feed
 from arview.station.live.stream.notices import Notice
-from arview.station.live.stream.phrases import with_messages
 from arview.station.live.stream.recording import Recordings
 from arview.station.live.stream.station import StationCamera
 from arview.station.live.stream.subjects import Subjects
@@ -78,7 +78,7 @@ class Hub:
         self.desk = JobDesk(options.jobs)
         self.clients: dict[str, Client] = {}
         self.watchers = 0
-        self._loading = loading_document(options, "loading", "the part is being loaded")
+        self._loading = loading_document(options, "loading", sentence("told.loading"))
         self._part: tuple[int, Document] | None = None
         self._glb: dict[str, asyncio.Task[bytes]] = {}
         self._station: StationCamera | None = None

@@ -14,6 +14,7 @@ import numpy as np
 
 from arview import tracking
 from arview.camera import Camera, FrameView, guess_camera, require_brown
+from arview.core.messages import sentence
 from arview.errors import ArviewError
 from arview.pose import Pose, TrackingState
 from arview.station.live.options import UNDISTORT
@@ -194,9 +195,9 @@ class Feed:
         """State of the stream and its description for the page."""
         age_ms = self.age_ms
         if age_ms is None:
-            return "waiting", "waiting for the first picture"
+            return "waiting", sentence("told.first_picture")
         if age_ms > 1e3 * SILENCE_S:
-            return "waiting", f"no picture for {age_ms / 1e3:.0f} s"
+            return "waiting", sentence("told.no_picture", seconds=f"{age_ms / 1e3:.0f}")
         return "live", ""
 
     def notices(self) -> list[Notice]:
@@ -207,17 +208,12 @@ class Feed:
             notices.append(Notice("camera_estimated", "info", estimate.text))
         newest = self.newest
         if newest is not None and newest.frame.scale < MIN_SCALE:
-            notices.append(
-                Notice("frames_scaled", "warning", f"pictures arrive at {newest.frame.scale:.0%} of their size")
-            )
+            share = f"{newest.frame.scale:.0%}"
+            notices.append(Notice("frames_scaled", "warning", sentence("told.scaled", share=share)))
         if self._unreadable_in_a_row >= MAX_UNREADABLE:
-            notices.append(
-                Notice("stamp_unreadable", "error", "pictures arrive damaged: their frame counter cannot be read")
-            )
+            notices.append(Notice("stamp_unreadable", "error", sentence("told.damaged")))
         if self.failures:
-            notices.append(
-                Notice("tracking_failed", "error", f"the tracking failed and was restarted {self.failures} times")
-            )
+            notices.append(Notice("tracking_failed", "error", sentence("told.restarted", count=self.failures)))
         return notices
 
     def _tell_estimate(self) -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from arview import overlay
 from arview.cad import Model
+from arview.core.messages import sentence
 from arview.errors import ArviewError, MismatchError
 from arview.inspection import Inspection, load_inspection
 from arview.station.live.stream.notices import Notice, without_folder
@@ -70,10 +71,9 @@ class InspectionFile:
         notices += age_notices(self.inspection, self._max_age_s, now)
         measured = self.inspection.serial
         if self._serial and measured != self._serial:
-            other = f"of {measured}" if measured else "without a serial number"
-            notices.append(
-                Notice("inspection_serial", "error", f"the inspection is {other}, this part is {self._serial}")
-            )
+            key, given = ("serial", {"serial": measured}) if measured else ("no_serial", {})
+            text = sentence(f"told.inspection_{key}", own=self._serial, **given)
+            notices.append(Notice("inspection_serial", "error", text))
         return notices
 
     def _file_state(self) -> _State:
@@ -89,10 +89,10 @@ def age_notices(inspection: Inspection, max_age_s: float | None, now: datetime |
     """The notices about the age of an inspection at this time (default: now): too old, or from the future."""
     age_s = inspection.age_s(now or datetime.now(UTC))
     if age_s < -CLOCK_SLACK_S:
-        text = f"measured in the future, by {_lead_text(-age_s)}: check the clocks of this machine and of the other"
+        text = sentence("told.future", lead=_lead_text(-age_s))
         return [Notice("inspection_future", "warning", text)]
     if max_age_s is not None and age_s > max_age_s:
-        return [Notice("inspection_old", "warning", f"measured {overlay.age_text(age_s)}: measure again")]
+        return [Notice("inspection_old", "warning", sentence("told.old", age=overlay.age_text(age_s)))]
     return []
 
 

@@ -8,6 +8,7 @@ import time
 
 import numpy as np
 
+from arview.core.messages import sentence
 from arview.errors import ArviewError, without_credentials
 from arview.station.live.protocol import FRAME_IDS
 from arview.station.live.stream.feed import Feed
@@ -88,7 +89,7 @@ class StationCamera:
         if self._fault:
             return "reconnecting", self._fault
         if self.is_frozen:
-            return "frozen", "the camera delivers the same picture again and again"
+            return "frozen", sentence("told.same_picture")
         return self._feed.state
 
     @property
@@ -102,10 +103,10 @@ class StationCamera:
         if self._fault:
             return [Notice("source_reconnecting", "error", f"{self._fault}; reconnecting")]
         if self.is_frozen:
-            return [Notice("source_frozen", "error", "the camera delivers the same picture again and again")]
-        state, text = self._feed.state
-        if state == "waiting" and self._feed.newest is not None:
-            return [Notice("source_frozen", "error", f"the camera delivers {text}")]
+            return [Notice("source_frozen", "error", sentence("told.same_picture"))]
+        age_ms = self._feed.age_ms
+        if age_ms is not None and self._feed.state[0] == "waiting" and self._feed.newest is not None:
+            return [Notice("source_frozen", "error", sentence("told.camera_silent", seconds=f"{age_ms / 1e3:.0f}"))]
         return []
 
     def _run(self) -> None:

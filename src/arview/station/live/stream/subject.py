@@ -11,6 +11,7 @@ from arview import guideviews, tracking
 from arview import overlay as overlays
 from arview.cad import Part
 from arview.camera import Camera, guess_camera
+from arview.core.messages import sentence
 from arview.fiducials import SerialNumbers
 from arview.inspection import Inspection
 from arview.station.live.options import LiveOptions
@@ -125,7 +126,7 @@ class Subject:
     def notices(self) -> list[Notice]:
         """The notices about the inspection."""
         if self._file is None:
-            return [Notice("inspection_none", "info", "no inspection: nothing has been measured")]
+            return [Notice("inspection_none", "info", sentence("told.inspection_none"))]
         return self._file.notices()
 
     def tracked_part(self, camera: Camera) -> tracking.TrackedPart:

@@ -8,6 +8,7 @@ from dataclasses import replace
 from arview import overlay as overlays
 from arview import tracking
 from arview.camera import Camera, guess_camera, load_camera
+from arview.core.messages import sentence
 from arview.fiducials import SerialNumbers
 from arview.station.live.options import LiveOptions
 from arview.station.live.stream.notices import Notice
@@ -66,9 +67,7 @@ class Subjects:
             about = f"{one.name}: " if one.name else ""
             notices += [replace(notice, text=about + notice.text) for notice in one.notices()]
         if self.options.camera is None:
-            notices.append(
-                Notice("camera_guessed", "warning", "camera not calibrated: distances to the part are only rough")
-            )
+            notices.append(Notice("camera_guessed", "warning", sentence("told.camera_guessed")))
         return notices
 
     def camera(

@@ -1,5 +1,5 @@
 // The texts of the page: one catalogue for each language, with English for whatever a language lacks. Sentences of the
-// server are English; of those that the page knows, key and values come along (`messages` in the protocol).
+// server arrive in English, with key and values (`messages` in the protocol) for the other languages.
 
 import de from "./de.js";
 import en from "./en.js";
@@ -65,8 +65,8 @@ function inLanguage(value, messages) {
 
 /** A sentence of the server, or several that "; " divides. */
 function sentence(text, messages) {
-  if (messages[text]) return inWords(messages[text]);
-  return text.split("; ").map((one) => (messages[one] ? inWords(messages[one]) : one)).join("; ");
+  const said = (one) => (messages[one]?.key in catalogues[language] ? inWords(messages[one]) : one);
+  return messages[text] ? said(text) : text.split("; ").map(said).join("; ");
 }
 
 /** The message of an error {error: code, message} of the server. */
