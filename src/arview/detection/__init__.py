@@ -13,8 +13,6 @@ if TYPE_CHECKING:
     from arview.detection.detector import options_for as options_for
     from arview.detection.features.edge_net import EdgeNet as EdgeNet
     from arview.detection.features.image_pyramid import ImagePyramid as ImagePyramid
-    from arview.detection.features.response_maps import response_maps as response_maps
-    from arview.detection.features.response_maps import score_around as score_around
     from arview.detection.scene_change import SceneChange as SceneChange
     from arview.detection.scoring.crops import BAND_PX as BAND_PX
     from arview.detection.scoring.crops import DRAWN_CHANNELS as DRAWN_CHANNELS
@@ -32,8 +30,8 @@ if TYPE_CHECKING:
     from arview.detection.search.local_search import FINE_TOLERANCE_PX as FINE_TOLERANCE_PX
     from arview.detection.search.local_search import LocalSearch as LocalSearch
     from arview.detection.search.local_search import LocalSearchOptions as LocalSearchOptions
-    from arview.detection.search.nms import select_distinct as select_distinct
-    from arview.detection.search.pattern_search import search_poses as search_poses
+    from arview.detection.search.near_search import NearSearch as NearSearch
+    from arview.detection.search.near_search import PoseGrid as PoseGrid
 
 __getattr__, __dir__, __all__ = lazy_door(
     __name__,
@@ -48,10 +46,6 @@ __getattr__, __dir__, __all__ = lazy_door(
         ),
         "features.edge_net": ("EdgeNet",),
         "features.image_pyramid": ("ImagePyramid",),
-        "features.response_maps": (
-            "response_maps",
-            "score_around",
-        ),
         "scene_change": ("SceneChange",),
         "scoring.crops": (
             "BAND_PX",
@@ -75,7 +69,9 @@ __getattr__, __dir__, __all__ = lazy_door(
             "LocalSearch",
             "LocalSearchOptions",
         ),
-        "search.nms": ("select_distinct",),
-        "search.pattern_search": ("search_poses",),
+        "search.near_search": (
+            "NearSearch",
+            "PoseGrid",
+        ),
     },
 )

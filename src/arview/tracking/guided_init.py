@@ -9,14 +9,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from arview.camera import Camera
 from arview.core.parallel import pool
-from arview.detection import response_maps, score_around
-from arview.geometry import Array, apply, are_near, rotation_angle_rad, turn_ball
+from arview.detection import NearSearch, PoseGrid
+from arview.geometry import Array, apply, rotation_angle_rad, turn_ball
 from arview.guideviews import PLAIN_LINES, GuideViewSet, view_lines
 from arview.refinement import (
     LAST_STAGES,
@@ -27,7 +26,6 @@ from arview.refinement import (
     PoseRefiner,
     RefinementPyramid,
     WorkingScaleOptions,
-    intrinsics_of,
 )
 
 TURN_LIMIT_DEG = 20.0
@@ -54,8 +52,6 @@ MAX_RIVAL_DISTANCE = 0.85
 """A nearer pose at a larger ratio is the same pose."""
 CROP_REACH = 1.35
 """Half size of the crop, in half diameters, because the part may be nearer than the given pose."""
-MAX_SCORED = 400
-"""Best poses of a grid that are compared with each other."""
 CONTOUR_POINTS = 64
 DESIGN_POINTS = 32
 """Points of outline and of design edges that are scored."""
@@ -84,20 +80,14 @@ class SearchLevel:
 
     Attributes:
         radius_px: half diameter of the part in the reduced picture.
-        turns: (R,3,3) rotations of the grid.
-        stretches: (D,) factors of the distance of the grid.
-        shift_px: largest shift of the grid, px of the reduced picture.
-        shift_step_px: distance of the shifts.
+        grid: of the poses around every start.
         kept_each: best poses kept around one start.
         kept: best poses kept in all.
         separation_deg: smallest difference between poses that are kept; 1° corresponds to 1 % of the diameter.
     """
 
     radius_px: float
-    turns: Array
-    stretches: Array
-    shift_px: int
-    shift_step_px: int
+    grid: PoseGrid
     kept_each: int
     kept: int
     separation_deg: float
@@ -105,10 +95,7 @@ class SearchLevel:
 
 COARSE = SearchLevel(
     radius_px=26.0,
-    turns=turn_ball(16.0, 9.0),
-    stretches=np.geomspace(0.85, 1.15, 7),
-    shift_px=8,
-    shift_step_px=2,
+    grid=PoseGrid(turn_ball(16.0, 9.0), np.geomspace(0.85, 1.15, 7), shift_px=8, shift_step_px=2),
     kept_each=8,
     kept=8,
     separation_deg=4.0,
@@ -116,10 +103,7 @@ COARSE = SearchLevel(
 """First round: rotations up to 15°, 15 % of the distance, shifts of 15 % of the diameter."""
 FINE = SearchLevel(
     radius_px=80.0,
-    turns=turn_ball(3.6, 2.4),
-    stretches=np.linspace(0.97, 1.03, 5),
-    shift_px=4,
-    shift_step_px=2,
+    grid=PoseGrid(turn_ball(3.6, 2.4), np.linspace(0.97, 1.03, 5), shift_px=4, shift_step_px=2),
     kept_each=1,
     kept=4,
     separation_deg=1.5,
@@ -127,10 +111,7 @@ FINE = SearchLevel(
 """Second round: between the poses of the first grid."""
 RIVAL = SearchLevel(
     radius_px=26.0,
-    turns=turn_ball(22.0, 10.0),
-    stretches=np.geomspace(0.69, 1.38, 8),
-    shift_px=12,
-    shift_step_px=3,
+    grid=PoseGrid(turn_ball(22.0, 10.0), np.geomspace(0.69, 1.38, 8), shift_px=12, shift_step_px=3),
     kept_each=3,
     kept=3,
     separation_deg=4.0,
@@ -153,6 +134,9 @@ class GuidedInit:
         self._views = views
         self._center_in_model = views.center_in_model
         self._refiner = PoseRefiner(PartView(views), camera)
+        part, diameter_mm = self._refiner.part.arrays, self._refiner.diameter_mm
+        points = {"contour_points": CONTOUR_POINTS, "design_points": DESIGN_POINTS}
+        self._near = NearSearch(part, camera, diameter_mm, **points)
 
     def find(self, image: NDArray[np.uint8], cam_from_model: Array) -> GuidedPose | None:
         """The best pose within 15°, 15 % of the distance and a shift of 15 % of the diameter, whatever its quality.
@@ -232,62 +216,18 @@ class GuidedInit:
         """
         if not starts or around[2, 3] <= 0:
             return []
-        maps = self._maps(image, around, level)
-        if maps is None:
-            return []
-
-        def search(start: Array) -> list[tuple[float, Array]]:
-            scores, poses = score_around(
-                maps[0],
-                self._refiner.part.arrays,
-                start,
-                maps[1],
-                0.01 * self._refiner.diameter_mm,
-                level.turns,
-                level.stretches,
-                level.shift_px,
-                level.shift_step_px,
-                CONTOUR_POINTS,
-                DESIGN_POINTS,
-            )
-            best: list[tuple[float, Array]] = []
-            for index in np.argsort(-scores)[:MAX_SCORED]:
-                if not any(self._is_same(poses[index], other, level.separation_deg) for _, other in best):
-                    best.append((float(scores[index]), poses[index]))
-                    if len(best) >= level.kept_each:
-                        break
-            return best
-
-        found = sorted((item for best in pool().map(search, starts) for item in best), key=lambda item: -item[0])
-        chosen: list[Array] = []
-        for score, pose in found:
-            if score < min_score:
-                break
-            if not any(self._is_same(pose, other, level.separation_deg) for other in chosen):
-                chosen.append(pose)
-        return chosen[: level.kept]
-
-    def _maps(
-        self, image: NDArray[np.uint8], cam_from_body: Array, level: SearchLevel
-    ) -> tuple[NDArray[np.uint8], Array] | None:
-        """Response maps of a reduced crop around a pose (4,4), and its intrinsics; None outside the picture."""
-        camera = self.camera
-        radius_px = self._refiner.radius_px(cam_from_body)
+        radius_px = self._near.radius_px(around)
         scale = min(1.0, level.radius_px / radius_px)
-        reach_px = CROP_REACH * radius_px + level.shift_px / scale
-        center = camera.project(cam_from_body[:3, 3])
-        size = np.array([camera.width, camera.height])
-        first = np.clip(np.floor(center - reach_px), 0, size).astype(int)
-        last = np.clip(np.ceil(center + reach_px) + 1, 0, size).astype(int)
-        small = np.round((last - first) * scale).astype(int)
-        if small.min() < 16:
-            return None
-        part = np.ascontiguousarray(image[first[1] : last[1], first[0] : last[0]])
-        part = np.asarray(cv2.resize(part, (int(small[0]), int(small[1])), interpolation=cv2.INTER_AREA))
-        pad = level.shift_px
-        intrinsics = intrinsics_of(camera.cropped(*first.tolist(), *(last - first).tolist()).scaled(*small.tolist()))
-        intrinsics[2:4] += pad
-        return response_maps(part, SPREAD_PX, pad), intrinsics
+        reach_px = CROP_REACH * radius_px + level.grid.shift_px / scale
+        crop = self._near.crop(image, around, reach_px, scale, spread_px=SPREAD_PX, pad_px=level.grid.shift_px)
+        if crop is None:
+            return []
+        found = [
+            self._near.select(*crop.grid(start, level.grid), level.separation_deg, level.kept_each) for start in starts
+        ]
+        scores, poses = (np.concatenate(arrays) for arrays in zip(*found, strict=True))
+        scores, poses = self._near.select(scores, poses, level.separation_deg, level.kept)
+        return list(poses[scores >= min_score])
 
     def _best(self, image: NDArray[np.uint8], starts: list[Array]) -> GuidedPose | None:
         """The start (4,4) with the best scores after refinement.
@@ -319,7 +259,3 @@ class GuidedInit:
         levels = RefinementPyramid(self._refiner, image, starts, options=SCALE)
         spread_px = levels.finest.edge_spread_px(starts[0])
         return RefinementPyramid(self._refiner, image, starts, spread_px or 0.0, SCALE)
-
-    def _is_same(self, a: Array, b: Array, angle_deg: float) -> bool:
-        """Whether two poses (4,4) differ by less than an angle, and by as many per cent of the diameter."""
-        return are_near(a, b, 0.01 * angle_deg * self._refiner.diameter_mm, angle_deg)

@@ -145,7 +145,7 @@ class Tracker:
         # Only edges gain from an enlarged picture.
         self._scale = SCALE if self.options.use_edge else replace(SCALE, max_enlargement=1.0)
         self._recheck = recheck
-        self._search = WideSearch(self.refiner.part.arrays, camera, self.refiner.intrinsics, self.diameter_mm)
+        self._search = WideSearch(self.refiner.part.arrays, camera, self.diameter_mm)
         self._state: TrackerState | None = None
         self._texture: TextureModality | None = None
         if self.options.use_texture and model is not None:

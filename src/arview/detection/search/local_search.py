@@ -27,7 +27,7 @@ from arview.detection.scoring.pose_verifier import PoseVerifier
 from arview.detection.scoring.profile_ranker import FINE, ProfileRanker
 from arview.detection.search.global_search import QUICK, PoseCandidate, weight_by_lines
 from arview.detection.search.hypothesis import Hypothesis
-from arview.detection.search.nms import select_distinct
+from arview.detection.search.nms import distinct_poses
 from arview.detection.search.pattern_search import search_poses
 from arview.detection.search.polish import polish
 from arview.detection.search.template_bank import ViewLineCounts
@@ -280,15 +280,8 @@ class LocalSearch:
         scores = self._rough_ranker.scores(pyramid, poses, view_lines)
         scores = scores + RESPONSE_WEIGHT * weight_by_lines(responses, view_lines)
         scores += PREVIOUS_WEIGHT * before
-        order = np.argsort(-scores, kind="stable")
-        scores, poses = scores[order], poses[order]
-        share = 0.01 * level.distinct_deg
-        reach = np.full(len(poses), share * self.views.diameter_mm) / poses[:, 2, 3]
-        chosen = select_distinct(
-            np.ascontiguousarray(poses[:, :3, :3]), np.ascontiguousarray(poses[:, :3, 3]), reach,
-            np.cos(np.deg2rad(level.distinct_deg)), 1.0 + share, count,
-        )  # fmt: skip
-        return [PoseCandidate(float(scores[i]), poses[i]) for i in chosen]
+        found_scores, poses = distinct_poses(scores, poses, self.views.diameter_mm, level.distinct_deg, count)
+        return [PoseCandidate(float(score), pose) for score, pose in zip(found_scores, poses, strict=True)]
 
     def refine_and_verify(self, pyramid: ImagePyramid, starts: list[PoseCandidate]) -> list[Hypothesis]:
         """Verified hypotheses that some starts lead to, apart from each other, best first."""

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arview.core.kernel import kernel
+from arview.geometry import Array
 
 
 @kernel
@@ -66,3 +67,29 @@ def select_distinct(
             if count == most:
                 break
     return chosen[:count]
+
+
+def distinct_poses(
+    scores: Array, poses: Array, diameter_mm: float, separation_deg: float, count: int, limit: int | None = None
+) -> tuple[Array, Array]:
+    """The best of some poses (N,4,4), best first, none closer to a better one than a separation.
+
+    Args:
+        scores, poses: (N,) and (N,4,4).
+        diameter_mm: of the part.
+        separation_deg: angle within which poses are close; 1° corresponds to 1 % of the diameter and of the distance.
+        count: of poses returned at most.
+        limit: number of best poses that are compared at most.
+    """
+    order = np.argsort(-scores, kind="stable")[:limit]
+    scores, poses = scores[order], poses[order]
+    share = 0.01 * separation_deg
+    chosen = select_distinct(
+        np.ascontiguousarray(poses[:, :3, :3]),
+        np.ascontiguousarray(poses[:, :3, 3]),
+        np.full(len(poses), share * diameter_mm) / poses[:, 2, 3],
+        np.cos(np.deg2rad(separation_deg)),
+        1.0 + share,
+        count,
+    )
+    return scores[chosen], np.ascontiguousarray(poses[chosen])
