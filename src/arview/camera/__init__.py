@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from arview.camera.profiles import profile_path as profile_path
     from arview.camera.read import guess_camera as guess_camera
     from arview.camera.read import load_camera as load_camera
+    from arview.camera.read import load_cameras as load_cameras
     from arview.camera.read import save_camera as save_camera
     from arview.camera.read import split_spec as split_spec
     from arview.camera.undistort import MAX_HALF_ANGLE_DEG as MAX_HALF_ANGLE_DEG
@@ -67,6 +68,7 @@ __getattr__, __dir__, __all__ = lazy_door(
         "read": (
             "guess_camera",
             "load_camera",
+            "load_cameras",
             "save_camera",
             "split_spec",
         ),
