@@ -52,15 +52,13 @@ def read_points(path: str | Path) -> RawPoints:
         raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
     if not start:
         raise InputError(f"{path}: is empty")
-    for magic, read in ((b"ply", _read_ply), (b"LASF", _read_las), (b"ASTM-E57", _read_e57)):
-        if start.startswith(magic):
-            return read(path)
-    read_suffix = SUFFIXES.get(path.suffix.lower())
-    if read_suffix is None:
+    by_suffix = READERS.get(path.suffix.lower())
+    read = next((read for signature, read in SIGNATURES.items() if start.startswith(signature)), by_suffix)
+    if read is None:
         raise InputError(f"{path}: is no known format of a cloud; expected {', '.join(SUFFIXES)}")
-    if read_suffix in (_read_ply, _read_las, _read_e57):
+    if read is by_suffix and read in SIGNATURES.values() and not start.startswith(tuple(SIGNATURES)):
         raise InputError(f"{path}: is not a {path.suffix[1:].upper()} file with points")
-    return read_suffix(path)
+    return read(path)
 
 
 def _read_ply(path: Path) -> RawPoints:
@@ -81,13 +79,7 @@ def _read_ply(path: Path) -> RawPoints:
             names.append(words[2])
     if count < 0 or not {"x", "y", "z"} <= set(names) or not kind:
         raise InputError(f"{path}: is not a PLY file with points")
-    check_count(path, count)
-    least = 2 * len(names) if kind == "ascii" else record
-    if count * least > size:
-        raise InputError(f"{path}: is truncated: its header names {count} points, {size} bytes follow")
-    if kind == "ascii":
-        _check_lines(path, count)
-    return _by_open3d(path, count)
+    return _by_open3d(path, count, size, 2 * len(names) if kind == "ascii" else record, kind == "ascii")
 
 
 def _read_pcd(path: Path) -> RawPoints:
@@ -101,7 +93,6 @@ def _read_pcd(path: Path) -> RawPoints:
     repeats = [_integer(path, word) for word in fields.get("COUNT", ["1"] * len(sizes))]
     if len(sizes) != len(fields["FIELDS"]) or len(repeats) != len(sizes):
         raise InputError(f"{path}: its PCD header is damaged")
-    check_count(path, count)
     kind, size = (fields.get("DATA") or [""])[0], path.stat().st_size - len(header)
     record = sum(a * b for a, b in zip(sizes, repeats, strict=True))
     least = {"ascii": 2 * sum(repeats), "binary": record}.get(kind, 0)
@@ -113,25 +104,27 @@ def _read_pcd(path: Path) -> RawPoints:
             raise InputError(f"{path}: is truncated or damaged")
     elif kind not in ("ascii", "binary"):
         raise InputError(f"{path}: PCD data {kind!r}, expected ascii, binary or binary_compressed")
+    return _by_open3d(path, count, size, least, kind == "ascii")
+
+
+def _by_open3d(path: Path, count: int, size: int, least: int, is_text: bool) -> RawPoints:
+    """Points and normals of a PLY or PCD file as Open3D reads them.
+
+    Args:
+        path: of the file.
+        count: number of points that its header names.
+        size: bytes after the header.
+        least: fewest bytes of a point.
+        is_text: whether each point is a line; of missing lines Open3D would make zeros.
+    """
+    check_count(path, count)
     if count * least > size:
         raise InputError(f"{path}: is truncated: its header names {count} points, {size} bytes follow")
-    if kind == "ascii":
-        _check_lines(path, count)
-    return _by_open3d(path, count)
-
-
-def _check_lines(path: Path, count: int) -> None:
-    """Raise InputError when a text file has fewer lines than points: the reader would fill up with zeros."""
-    lines = 0
-    with path.open("rb") as file:
-        while block := file.read(BLOCK_BYTES):
-            lines += block.count(b"\n")
-    if lines < count:
-        raise InputError(f"{path}: is truncated: its header names {count} points, and it has {lines} lines")
-
-
-def _by_open3d(path: Path, count: int) -> RawPoints:
-    """Points and normals of a file whose header was checked, as Open3D reads them."""
+    if is_text:
+        with path.open("rb") as file:
+            lines = sum(block.count(b"\n") for block in iter(lambda: file.read(BLOCK_BYTES), b""))
+        if lines < count:
+            raise InputError(f"{path}: is truncated: its header names {count} points, and it has {lines} lines")
     o3d = load_open3d()
     try:
         with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
@@ -215,16 +208,14 @@ def _integer(path: Path, word: str) -> int:
     return int(word)
 
 
-SUFFIXES: dict[str, Callable[[Path], RawPoints]] = {
+SIGNATURES: dict[bytes, Callable[[Path], RawPoints]] = {b"ply": _read_ply, b"LASF": _read_las, b"ASTM-E57": _read_e57}
+"""Readers by the first bytes of a file, which decide before its suffix does."""
+READERS: dict[str, Callable[[Path], RawPoints]] = {
     ".ply": _read_ply,
     ".pcd": _read_pcd,
-    ".xyz": read_text,
-    ".pts": read_text,
-    ".csv": read_text,
-    ".txt": read_text,
-    ".asc": read_text,
-    ".las": _read_las,
-    ".laz": _read_las,
+    **dict.fromkeys((".xyz", ".pts", ".csv", ".txt", ".asc"), read_text),
+    **dict.fromkeys((".las", ".laz"), _read_las),
     ".e57": _read_e57,
 }
 """Readers by suffix."""
+SUFFIXES = tuple(READERS)
