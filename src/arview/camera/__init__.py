@@ -33,8 +33,7 @@ if TYPE_CHECKING:
     from arview.camera.undistort import UndistortOptions as UndistortOptions
     from arview.camera.undistort import brown_camera as brown_camera
     from arview.camera.undistort import require_brown as require_brown
-    from arview.camera.write import FORMATS as FORMATS
-    from arview.camera.write import format_of as format_of
+    from arview.camera.write import format_and_path as format_and_path
     from arview.camera.write import holds_distortion as holds_distortion
     from arview.camera.write import write_camera as write_camera
 
@@ -80,8 +79,7 @@ __getattr__, __dir__, __all__ = lazy_door(
             "require_brown",
         ),
         "write": (
-            "FORMATS",
-            "format_of",
+            "format_and_path",
             "holds_distortion",
             "write_camera",
         ),

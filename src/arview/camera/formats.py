@@ -13,7 +13,16 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from arview.camera.entry import CameraEntry
-from arview.camera.keys import CONTAINERS, NERF_SIGNS, ROLES, is_ignored, is_of_a_camera, is_suspicious, plain_name
+from arview.camera.keys import (
+    CONTAINERS,
+    NERF_SIGNS,
+    ROLES,
+    TERMS,
+    is_ignored,
+    is_of_a_camera,
+    is_suspicious,
+    plain_name,
+)
 from arview.camera.model import COLMAP_HALF_PX
 from arview.camera.terms import lens_from_terms
 from arview.camera.tree import numbers_of
@@ -191,7 +200,7 @@ def _read(node: Node, label: str) -> CameraEntry:
     found = {role: value for role, (_, value) in numbers.items()}
     width, height = (_whole(*numbers[role], low=1) if role in numbers else None for role in ("width", "height"))
     listed = found.pop("terms", None)
-    terms = {role: value for role, value in found.items() if ROLES.get(role) == role and role not in _NOT_TERMS}
+    terms = {role: value for role, value in found.items() if role in TERMS}
     dist, lens = lens_from_terms(_lens_models(models), listed, terms)
     if is_nerf:
         found = _nerf_defaults(found, width, height) | found
@@ -215,9 +224,6 @@ def _read(node: Node, label: str) -> CameraEntry:
         binning=(max(1, binning[0]), max(1, binning[1])),  # ROS writes 0 for none
         label=label,
     )
-
-
-_NOT_TERMS = {*_PINHOLE, "width", "height", "roi"}
 
 
 def _lens_models(models: Sequence[tuple[str, str]]) -> list[str]:

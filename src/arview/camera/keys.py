@@ -10,6 +10,8 @@ def _words(text: str) -> frozenset[str]:
     return frozenset(text.split())
 
 
+TERMS = _words("k1 k2 k3 k4 k5 k6 p1 p2 s1 s2 s3 s4 tauy taux omega xi")
+"""Roles of distortion terms given one by one."""
 _NAMES_OF_ROLE = {
     "matrix": "cameramatrix intrinsicmatrix camk k mtx intrinsics",
     "terms": "distortioncoefficients distcoeffs distcoeff distcoefs distortion dist d distortioncoeffs distortioncoeff "
@@ -27,7 +29,7 @@ _NAMES_OF_ROLE = {
     "roi": "roi",
     "binning_x": "binningx",
     "binning_y": "binningy",
-    **{name: name for name in _words("k1 k2 k3 k4 k5 k6 p1 p2 s1 s2 s3 s4 tauy taux omega xi")},
+    **{name: name for name in TERMS},
 }
 ROLES = {name: role for role, names in _NAMES_OF_ROLE.items() for name in _words(names)}
 """What a name stands for: a new format needs its names here."""
@@ -48,8 +50,6 @@ _IGNORED = _words(
     "fixaspectratio aspectratio flags boardwidth boardheight squaresize markersize cameraangley orientationoverride "
     "lensposition"
 )
-_LENS_RECORD = _words("make model focal_length_mm focal_length_35mm_mm digital_zoom width height")
-"""Entries of ``lens`` in a camera profile, see `arview.camera.profiles`."""
 _SUSPICIOUS = re.compile(
     r"distort|^dist$|coef|^lens|fisheye|crop|^roi|region|offset|binn|^bin$|scal|skip|zoom|skew|^tau|^xi$|omega|^alpha$"
     r"|decimat|(?:sub|down|up)sampl|resiz|mirror|flip|radial|tangential|prism|rectif|^[kpsdb]\d+$|^kc$|brown|equidist|kannala|^aoi|^pad|^trim|shift"
@@ -67,8 +67,9 @@ def plain_name(key: str) -> str:
 
 def is_ignored(key: str, value: Any) -> bool:
     """Whether a part of a file is no part of the camera: extrinsics, uncertainties, arview's records."""
-    if key == "lens" and isinstance(value, dict):
-        return set(value) <= _LENS_RECORD
+    if key == "lens" and isinstance(value, dict):  # make, model and focal length of a profile
+        told = {name: entry for name, entry in value.items() if name != "digital_zoom"}
+        return not any(ROLES.get(plain_name(n)) in TERMS | {"terms"} or is_suspicious(n, told[n]) for n in told)
     is_record = key == "calibration" and isinstance(value, dict) and str(value.get("tool", "")).startswith("arview")
     return is_record or plain_name(key) in _IGNORED
 
