@@ -247,11 +247,11 @@ def _several(value: Any, key: str, count: int) -> list[float]:
 
 
 def _nerf_defaults(found: Mapping[str, float], width: int | None, height: int | None) -> dict[str, float]:
-    """What nerfstudio leaves out: the centre of the picture, one of two focal lengths, or both with an angle."""
-    angle, focal = found.get("fov_x"), found.get("fx", found.get("fy"))
+    """What nerfstudio leaves out: the centre of the picture, the second focal length, or both beside an angle."""
+    angle, focal = found.get("fov_x"), found.get("fx")
     if angle is not None and not 0.0 < angle < math.pi:
         raise InputError(f"camera_angle_x is {angle:g}; expected an angle in rad between 0 and π")
-    if focal is None and angle is not None and width is not None:
+    if angle is not None and width is not None and not {"fx", "fy"} & set(found):
         focal = 0.5 * width / math.tan(0.5 * angle)
     centre = {} if width is None or height is None else {"cx": 0.5 * width, "cy": 0.5 * height}
     return centre if focal is None else centre | {"fx": focal, "fy": focal}
