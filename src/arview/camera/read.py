@@ -20,7 +20,7 @@ import numpy as np
 
 from arview.camera.colmap_text import colmap_text_of_binary, entries_from_colmap, is_colmap
 from arview.camera.entry import CameraEntry
-from arview.camera.exif import HEIF_SUFFIXES, PHOTO_SUFFIXES, focal_length_px, read_exif
+from arview.camera.exif import focal_length_px, photos_of, read_exif
 from arview.camera.formats import FORMATS, entries_from_trees
 from arview.camera.metashape import entries_from_metashape, is_metashape
 from arview.camera.model import Camera
@@ -273,7 +273,11 @@ def _camera_from_exif(source: str | Path | None, width: int | None, height: int 
     """The camera of photos by the focal length in the EXIF data of the first one."""
     if source is None:
         raise InputError("camera 'exif': no photo to read it from; give a photo, a folder or a glob of photos")
-    photo = _first_photo(Path(source))
+    photo = next(iter(photos_of(Path(source))), None)
+    if photo is None:
+        raise InputError(
+            f"{source}: no photo with EXIF data there (a video holds no focal length); give a camera file or fov:DEG"
+        )
     exif = read_exif(photo)
     if width is None or height is None:
         width, height = exif.upright_size
@@ -286,18 +290,3 @@ def _camera_from_exif(source: str | Path | None, width: int | None, height: int 
         f"{photo}: the EXIF data give {exif.focal_length_mm:g} mm but no 35 mm equivalent, and the sensor of "
         f"'{exif.model}' is not known; give a camera file or fov:DEG"
     )
-
-
-def _first_photo(source: Path) -> Path:
-    if source.is_file():
-        candidates = [source]
-    elif source.is_dir():
-        candidates = sorted(source.iterdir())
-    else:
-        candidates = sorted(source.parent.glob(source.name)) if source.parent.is_dir() else []
-    photos = [path for path in candidates if path.suffix.lower() in PHOTO_SUFFIXES | HEIF_SUFFIXES]
-    if not photos:
-        raise InputError(
-            f"{source}: no photo with EXIF data there (a video holds no focal length); give a camera file or fov:DEG"
-        )
-    return photos[0]
