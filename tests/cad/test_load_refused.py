@@ -79,6 +79,12 @@ def nan_ply(folder: Path) -> Path:
     return folder / "nan.ply"
 
 
+def loose_ply(folder: Path) -> Path:
+    path = nan_ply(folder)
+    path.write_text(path.read_text().replace("nan", "1").replace("3 0 1 2", "3 0 1 7"))
+    return path
+
+
 def truncated_3mf(folder: Path) -> Path:
     path = nested_3mf(folder)
     path.write_bytes(path.read_bytes()[:300])
@@ -155,6 +161,7 @@ REFUSED = [
     (truncated_ply, "broken or truncated PLY"),
     (point_ply, "no triangles"),
     (nan_ply, "NaN"),
+    (loose_ply, "a triangle of 'nan' refers to a vertex that does not exist"),
     (text_file("t.3mf"), "not a 3MF file"),
     (truncated_3mf, "not a 3MF file, or truncated"),
     (lambda f: write_3mf(f / "a.3mf", "", '<item objectid="4"/>'), "object 4 does not exist"),

@@ -189,7 +189,7 @@ HOSTILE_3MF = [
     ),
     (
         lambda f: write_3mf(f / "t.3mf", f'<object id="1">{LOOSE}</object>', '<item objectid="1"/>'),
-        "a triangle of object 1 refers to a vertex that does not exist",
+        "a triangle of .t. refers to a vertex that does not exist",
     ),
 ]
 

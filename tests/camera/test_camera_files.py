@@ -251,7 +251,7 @@ BAD_FILES = {
     "null value": ('{"fx": null, "fy": 1, "cx": 1, "cy": 1}', "fx is null"),
     "size zero": (own_json(width=0), "width is 0; expected a positive"),
     "broken json": ('{"fx": 600.5,', "not valid JSON"),
-    "json list": ("[1, 2, 3]", "the JSON is a list"),
+    "json list": ("[1, 2, 3]", "no camera matrix and no fx, fy, cx, cy"),
     "prose": ("these are not the intrinsics\n", "not a camera file"),
     "empty": ("\n", "is empty"),
     "broken xml": ("<?xml version='1.0'?><opencv_storage>", "not valid XML"),

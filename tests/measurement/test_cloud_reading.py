@@ -127,6 +127,7 @@ def test_las_laz_and_e57(tmp_path: Path) -> None:
     [
         ("a.ply", ply(count=901), "names 901 points"),
         ("b.ply", ply(kind="ascii")[:9000], "is truncated"),
+        ("b2.ply", b"k".join(ply(kind="ascii").rsplit(b"1", 1)), "is truncated or damaged"),
         ("c.ply", ply(count=90_000_000_000), "at most 100000000 are read"),
         ("d.ply", b"ply\nformat ascii 1.0\nelement vertex x\nend_header\n", "header is damaged"),
         ("e.pcd", pcd(5000), "is truncated"),

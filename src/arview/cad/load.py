@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
-from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,7 +12,8 @@ import numpy as np
 from arview.cad.fitness import clean_mesh, wrong_winding
 from arview.cad.formats.gltf import read_gltf
 from arview.cad.formats.obj import read_obj
-from arview.cad.formats.raw import UNIT_MM, RawComponent, RawModel, unique_names
+from arview.cad.formats.ply import read_ply
+from arview.cad.formats.raw import UNIT_MM, RawComponent, RawModel, short_list, unique_names
 from arview.cad.formats.step import read_step
 from arview.cad.formats.stl import read_stl
 from arview.cad.formats.threemf import read_3mf
@@ -31,7 +29,17 @@ if TYPE_CHECKING:
 
 PLUG_INS = "arview.readers"
 """Entry points of other packages, named by the suffix that each reads, without its dot."""
-SUFFIXES = (".step", ".stp", ".glb", ".gltf", ".obj", ".stl", ".ply", ".3mf")
+READERS: dict[str, Callable[[Path], RawModel]] = {
+    ".glb": read_gltf,
+    ".gltf": read_gltf,
+    ".obj": read_obj,
+    ".stl": read_stl,
+    ".ply": read_ply,
+    ".3mf": read_3mf,
+}
+"""Readers by suffix; that of STEP takes tolerances, too."""
+_STEP_SUFFIXES = (".step", ".stp")
+SUFFIXES = (*_STEP_SUFFIXES, *READERS)
 MIN_SIZE_MM, MAX_SIZE_MM = 1.0, 100_000.0
 """Range of the diameter of a part, for files whose unit may be wrong."""
 MIN_GIVEN_MM, MAX_GIVEN_MM = 0.1, 1_000_000.0
@@ -141,8 +149,7 @@ def load_cad(
         (flat, "triangles without area, or that were there twice, were left out"),
     ):
         if names_told:
-            rest = f" and {len(names_told) - 4} more" if len(names_told) > 4 else ""
-            notes.append(f"{text}: {', '.join(names_told[:4])}{rest}")
+            notes.append(f"{text}: {short_list(names_told)}")
     if not components:
         raise InputError(f"{path}: all triangles are degenerate (they have no area)")
     model = make_model(path.stem, tuple(components))
@@ -163,18 +170,10 @@ def check_step_tolerances(tol_linear_mm: float, tol_angular_deg: float) -> None:
 
 
 def _read(path: Path, suffix: str, tol_linear_mm: float, tol_angular_deg: float, is_overridden: bool) -> RawModel:
-    if suffix in (".step", ".stp"):
+    if suffix in _STEP_SUFFIXES:
         return read_step(path, tol_linear_mm, tol_angular_deg, is_overridden)
-    if suffix in (".glb", ".gltf"):
-        return read_gltf(path)
-    if suffix == ".obj":
-        return read_obj(path)
-    if suffix == ".3mf":
-        return read_3mf(path)
-    if suffix == ".stl":
-        return read_stl(path)
-    if suffix == ".ply":
-        return _read_ply(path)
+    if suffix in READERS:
+        return READERS[suffix](path)
     return _read_by_plug_in(path, find_plug_ins(PLUG_INS)[suffix[1:]])
 
 
@@ -191,52 +190,6 @@ def _read_by_plug_in(path: Path, entry: EntryPoint) -> RawModel:
     except Exception as error:  # another package's code
         raise InputError(f"{path}: {package_of(entry)} cannot read it ({type(error).__name__}: {error})") from error
     return raw
-
-
-def _read_ply(path: Path) -> RawModel:
-    """A PLY file read by trimesh: one mesh without a unit."""
-    import trimesh
-
-    try:
-        with _quiet_trimesh():
-            scene = trimesh.load_scene(BytesIO(path.read_bytes()), file_type="ply", process=False)
-    except Exception as error:  # trimesh raises whatever its parsers stumble over
-        printed = next(iter(str(error).splitlines()), "")
-        raise InputError(
-            f"{path}: broken or truncated PLY ({type(error).__name__}: {printed}); export it again"
-        ) from error
-    raw = RawModel()
-    several = len(scene.geometry) > 1
-    for name, mesh in scene.geometry.items():
-        faces = np.asarray(getattr(mesh, "faces", []), dtype=np.int64).reshape(-1, 3)
-        if len(faces) == 0:
-            continue
-        vertices = np.asarray(mesh.vertices, dtype=np.float64)
-        if faces.min() < 0 or faces.max() >= len(vertices):
-            raise InputError(f"{path}: broken: a triangle refers to vertex {faces.max()} of {len(vertices)}")
-        color = None
-        if mesh.visual.kind in ("vertex", "face"):
-            colors = mesh.visual.vertex_colors if mesh.visual.kind == "vertex" else mesh.visual.face_colors
-            red, green, blue = np.asarray(colors, dtype=np.float64)[:, :3].mean(axis=0) / 255.0
-            color = (float(red), float(green), float(blue))
-        raw.add(RawComponent((str(name),) if several else (), vertices, faces, color), path)
-    return raw
-
-
-@contextmanager
-def _quiet_trimesh() -> Iterator[None]:
-    """Suppress the warnings of trimesh and numpy about malformed files."""
-    logger, silent = logging.getLogger("trimesh"), logging.NullHandler()
-    was_passed_on = logger.propagate
-    # Its modules have loggers of their own, whose records end here.
-    logger.addHandler(silent)
-    logger.propagate = False
-    try:
-        with np.errstate(all="ignore"):
-            yield
-    finally:
-        logger.propagate = was_passed_on
-        logger.removeHandler(silent)
 
 
 def _check_finite(component: RawComponent, path: Path) -> None:

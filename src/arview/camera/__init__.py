@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from arview.camera.profiles import profile_path as profile_path
     from arview.camera.read import guess_camera as guess_camera
     from arview.camera.read import load_camera as load_camera
+    from arview.camera.read import load_cameras as load_cameras
     from arview.camera.read import save_camera as save_camera
     from arview.camera.read import split_spec as split_spec
     from arview.camera.undistort import MAX_HALF_ANGLE_DEG as MAX_HALF_ANGLE_DEG
@@ -32,8 +33,7 @@ if TYPE_CHECKING:
     from arview.camera.undistort import UndistortOptions as UndistortOptions
     from arview.camera.undistort import brown_camera as brown_camera
     from arview.camera.undistort import require_brown as require_brown
-    from arview.camera.write import FORMATS as FORMATS
-    from arview.camera.write import format_of as format_of
+    from arview.camera.write import format_and_path as format_and_path
     from arview.camera.write import holds_distortion as holds_distortion
     from arview.camera.write import write_camera as write_camera
 
@@ -67,6 +67,7 @@ __getattr__, __dir__, __all__ = lazy_door(
         "read": (
             "guess_camera",
             "load_camera",
+            "load_cameras",
             "save_camera",
             "split_spec",
         ),
@@ -78,8 +79,7 @@ __getattr__, __dir__, __all__ = lazy_door(
             "require_brown",
         ),
         "write": (
-            "FORMATS",
-            "format_of",
+            "format_and_path",
             "holds_distortion",
             "write_camera",
         ),

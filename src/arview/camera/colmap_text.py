@@ -12,15 +12,13 @@ from arview.camera.terms import simplest
 from arview.errors import InputError
 
 # Indices of fx, fy, cx, cy and of the terms of the lens, in the parameters of each model.
-_BROWN_MODELS: dict[str, tuple[tuple[int, ...], tuple[int, ...]]] = {
-    "SIMPLE_PINHOLE": ((0, 0, 1, 2), ()),
-    "PINHOLE": ((0, 1, 2, 3), ()),
-    "SIMPLE_RADIAL": ((0, 0, 1, 2), (3,)),
-    "RADIAL": ((0, 0, 1, 2), (3, 4)),
-    "OPENCV": ((0, 1, 2, 3), (4, 5, 6, 7)),
-    "FULL_OPENCV": ((0, 1, 2, 3), (4, 5, 6, 7, 8, 9, 10, 11)),
-}
-_LENS_MODELS: dict[str, tuple[tuple[int, ...], tuple[int, ...], LensModel]] = {
+_MODELS: dict[str, tuple[tuple[int, ...], tuple[int, ...], LensModel]] = {
+    "SIMPLE_PINHOLE": ((0, 0, 1, 2), (), LensModel.RATIONAL),
+    "PINHOLE": ((0, 1, 2, 3), (), LensModel.RATIONAL),
+    "SIMPLE_RADIAL": ((0, 0, 1, 2), (3,), LensModel.RATIONAL),
+    "RADIAL": ((0, 0, 1, 2), (3, 4), LensModel.RATIONAL),
+    "OPENCV": ((0, 1, 2, 3), (4, 5, 6, 7), LensModel.RATIONAL),
+    "FULL_OPENCV": ((0, 1, 2, 3), (4, 5, 6, 7, 8, 9, 10, 11), LensModel.RATIONAL),
     "SIMPLE_FISHEYE": ((0, 0, 1, 2), (), LensModel.FISHEYE),
     "FISHEYE": ((0, 1, 2, 3), (), LensModel.FISHEYE),
     "SIMPLE_RADIAL_FISHEYE": ((0, 0, 1, 2), (3,), LensModel.FISHEYE),
@@ -103,9 +101,8 @@ def _data_lines(text: str) -> list[str]:
 def _entry(line: str) -> CameraEntry:
     fields = line.split()
     label, model = fields[0][:20], fields[1][:40] if len(fields) > 1 else ""
-    if model not in _BROWN_MODELS and model not in _LENS_MODELS:
-        known = ", ".join((*_BROWN_MODELS, *_LENS_MODELS))
-        raise InputError(f"camera {label}: lens model {model} is not supported; use one of {known}")
+    if model not in _MODELS:
+        raise InputError(f"camera {label}: lens model {model} is not supported; use one of {', '.join(_MODELS)}")
     try:
         width, height = int(fields[2]), int(fields[3])
         params = [float(value) for value in fields[4:]]
@@ -113,10 +110,7 @@ def _entry(line: str) -> CameraEntry:
         raise InputError(
             f"camera {label}: '{line[:60]}' is not ID MODEL WIDTH HEIGHT PARAMS; export it again"
         ) from error
-    if model in _BROWN_MODELS:
-        (places, lens_places), kind = _BROWN_MODELS[model], LensModel.RATIONAL
-    else:
-        places, lens_places, kind = _LENS_MODELS[model]
+    places, lens_places, kind = _MODELS[model]
     expected = max(*places, *lens_places) + 1
     if len(params) != expected:
         raise InputError(f"camera {label}: {model} needs {expected} parameters, the file gives {len(params)}")

@@ -124,6 +124,16 @@ def exif_of(picture: Image) -> PhotoExif:
     )
 
 
+def photos_of(source: Path) -> list[Path]:
+    """The photos of a file, a folder or a glob pattern, by the suffixes of their names."""
+    candidates = [source]
+    if source.is_dir():
+        candidates = sorted(source.iterdir())
+    elif not source.is_file():
+        candidates = sorted(source.parent.glob(source.name)) if source.parent.is_dir() else []
+    return [path for path in candidates if path.suffix.lower() in PHOTO_SUFFIXES | HEIF_SUFFIXES]
+
+
 def read_exif(path: Path) -> PhotoExif:
     """EXIF data of a photo; absent and malformed entries keep their defaults.
 

@@ -12,12 +12,15 @@ from xml.etree import ElementTree
 
 from arview.camera.entry import CameraEntry
 from arview.camera.model import COLMAP_HALF_PX
+from arview.camera.tree import parse_xml
 from arview.errors import InputError
 
 _HEAD = 4000
 _MAX_SKEW = 1e-5
 """Largest skew, as a share of the focal length, that moves no pixel of a picture by a hundredth."""
 _HINT = "export the photos undistorted (File > Export > Undistort Photos) and give --camera of those"
+_SIZE = ("width", "height")
+_TERM = re.compile(r"f|c[xy]|[kpb]\d")
 _UNSUPPORTED = ("k4", "p3", "p4")
 
 
@@ -35,12 +38,7 @@ def entries_from_metashape(text: str, name: str = "") -> list[CameraEntry]:
     Raises:
         InputError: broken XML, or a sensor that is not a frame camera of Brown's terms.
     """
-    if "<!DOCTYPE" in text or "<!ENTITY" in text:
-        raise InputError("the XML defines entities, which Metashape never writes; export the cameras again")
-    try:
-        root = ElementTree.fromstring(text)
-    except ElementTree.ParseError as error:
-        raise InputError(f"is not valid XML ({error}); export the cameras from Metashape again") from error
+    root = parse_xml(text)
     if root.tag == "calibration":
         return [_entry(root, None, "")]
     sensors = [(one, one.get("label") or f"sensor{one.get('id', '')}") for one in root.iter("sensor")]
@@ -68,15 +66,11 @@ def _entry(calibration: ElementTree.Element, sensor: ElementTree.Element | None,
     kind = kind or (None if sensor is None else sensor.get("type")) or "frame"
     if kind.strip() != "frame":
         raise InputError(f"{of_label}a {kind.strip()[:30]} camera of Metashape is not read; {_HINT}")
-    numbers = {
-        one.tag: _number(one, of_label)
-        for one in calibration
-        if one.tag in ("width", "height", "f", "cx", "cy", *_UNSUPPORTED) or re.fullmatch(r"[kpb]\d", one.tag)
-    }
     size = calibration.find("resolution")
     size = sensor.find("resolution") if size is None and sensor is not None else size
-    if size is not None:
-        numbers |= {key: _whole(size.get(key, ""), of_label) for key in ("width", "height")}
+    texts = {one.tag: one.text for one in calibration if one.tag in _SIZE or _TERM.fullmatch(one.tag)}
+    texts |= {} if size is None else {key: size.get(key) for key in _SIZE}
+    numbers = {key: _number(key, text or "", of_label) for key, text in texts.items()}
     missing = [key for key in ("width", "height", "f") if not numbers.get(key, 0.0) > 0.0]
     if missing:
         raise InputError(f"{of_label}its calibration has no {', '.join(missing)}; export the cameras again")
@@ -103,17 +97,12 @@ def _entry(calibration: ElementTree.Element, sensor: ElementTree.Element | None,
     )
 
 
-def _number(element: ElementTree.Element, of_label: str) -> float:
+def _number(key: str, text: str, of_label: str) -> float:
     try:
-        number = float(element.text or "")
+        number = float(text)
     except ValueError:
         number = math.nan
-    if not math.isfinite(number):
-        raise InputError(f"{of_label}{element.tag} is {(element.text or '')[:40]!r}; expected a number; export again")
+    if not math.isfinite(number) or (key in _SIZE and number != int(number)):
+        kind = "whole number of px" if key in _SIZE else "number"
+        raise InputError(f"{of_label}{key} is {text[:40]!r}; expected a {kind}; export again")
     return number
-
-
-def _whole(text: str, of_label: str) -> float:
-    if not text.isdecimal() or len(text) > 9:
-        raise InputError(f"{of_label}resolution is {text[:20]!r}; expected whole numbers of px; export again")
-    return float(text)

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from arview.camera.exif import HEIF_SUFFIXES, PHOTO_SUFFIXES, PhotoExif, read_exif
+from arview.camera.exif import PhotoExif, photos_of, read_exif
 from arview.errors import InputError
 
 _FOCAL_ROUNDING_MM, _EQUIVALENT_ROUNDING_MM, _ZOOM_TOLERANCE = 0.055, 0.5, 0.01
@@ -160,14 +160,11 @@ def lens_of_source(source: Path) -> dict[str, Any]:
     Raises:
         InputError: the source is none of these, or cannot be read.
     """
-    if source.is_dir():
-        photos = sorted(p for p in source.iterdir() if p.suffix.lower() in PHOTO_SUFFIXES | HEIF_SUFFIXES)
-        if not photos:
-            raise InputError(f"camera 'profile': {source}: the folder holds no photo; give profile:NAME")
-        source = photos[0]
-    if source.suffix.lower() in PHOTO_SUFFIXES | HEIF_SUFFIXES:
-        exif = read_exif(source)
+    if photos := photos_of(source):
+        exif = read_exif(photos[0])
         return lens_record(exif, *_sensor_size(exif))
+    if source.is_dir():
+        raise InputError(f"camera 'profile': {source}: the folder holds no photo; give profile:NAME")
     if not source.is_file():
         raise InputError(f"camera 'profile': {source} is not a file with metadata of its camera; give profile:NAME")
     size = _stored_size(source)

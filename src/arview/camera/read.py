@@ -12,7 +12,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ import numpy as np
 
 from arview.camera.colmap_text import colmap_text_of_binary, entries_from_colmap, is_colmap
 from arview.camera.entry import CameraEntry
-from arview.camera.exif import HEIF_SUFFIXES, PHOTO_SUFFIXES, focal_length_px, read_exif
+from arview.camera.exif import focal_length_px, photos_of, read_exif
 from arview.camera.formats import FORMATS, entries_from_trees
 from arview.camera.metashape import entries_from_metashape, is_metashape
 from arview.camera.model import Camera
@@ -32,6 +32,12 @@ from arview.errors import ArviewError, InputError, MismatchError, OutputError
 
 MAX_MESSAGE = 400
 """Letters of a message about the content of a file."""
+READERS: tuple[tuple[Callable[[str], bool], Callable[[str, str], list[CameraEntry]]], ...] = (
+    (is_colmap, entries_from_colmap),
+    (is_metashape, entries_from_metashape),
+)
+"""Whether a text is of a format, and its reader, which takes the text and the name of the camera that is wanted. What
+none of them knows is read as a tree of JSON, YAML, XML or INI, by the names in `arview.camera.keys`."""
 
 
 def load_camera(
@@ -78,6 +84,16 @@ def load_camera(
     if turns != 2 and None not in file_size and _scale_matches(file_size, (width, height)):
         return _fit_to_frames(entry, path, width, height)
     return _fit_to_frames(entry, path, *upright).rotated(turns)
+
+
+def load_cameras(path: str | Path) -> dict[str, Camera]:
+    """All cameras of a file, at the sizes that it gives, by their names in it.
+
+    Raises:
+        InputError: the file is missing, cannot be read, has no known format or holds impossible values.
+    """
+    path = Path(path)
+    return {entry.label: _fit_to_frames(entry, path, None, None) for entry in _read_entries(path, "")}
 
 
 def save_camera(camera: Camera, path: str | Path) -> None:
@@ -215,6 +231,10 @@ def split_spec(spec: str | Path) -> tuple[Path, str]:
     return Path(text), ""
 
 
+def _entries_from_tree(text: str, name: str) -> list[CameraEntry]:
+    return entries_from_trees(parse_trees(text), name)
+
+
 def _read_entries(path: Path, name: str) -> list[CameraEntry]:
     if path.is_dir():
         raise InputError(f"{path}: is a folder; give the camera file itself ({FORMATS})")
@@ -238,13 +258,8 @@ def _read_entries(path: Path, name: str) -> list[CameraEntry]:
     if not stripped:
         raise InputError(f"{path}: the camera file is empty; expected {FORMATS}")
     try:
-        if is_colmap(stripped):
-            entries = entries_from_colmap(stripped, name)
-        elif is_metashape(stripped):
-            entries = entries_from_metashape(stripped, name)
-        else:
-            entries = entries_from_trees(parse_trees(stripped), name)
-        return [entry.as_recorded() for entry in entries]
+        read = next((read for is_format, read in READERS if is_format(stripped)), _entries_from_tree)
+        return [entry.as_recorded() for entry in read(stripped, name)]
     except ArviewError as error:
         # Texts of the file in a message may be long, or have several lines.
         text = " ".join(str(error).split())
@@ -258,7 +273,11 @@ def _camera_from_exif(source: str | Path | None, width: int | None, height: int 
     """The camera of photos by the focal length in the EXIF data of the first one."""
     if source is None:
         raise InputError("camera 'exif': no photo to read it from; give a photo, a folder or a glob of photos")
-    photo = _first_photo(Path(source))
+    photo = next(iter(photos_of(Path(source))), None)
+    if photo is None:
+        raise InputError(
+            f"{source}: no photo with EXIF data there (a video holds no focal length); give a camera file or fov:DEG"
+        )
     exif = read_exif(photo)
     if width is None or height is None:
         width, height = exif.upright_size
@@ -271,18 +290,3 @@ def _camera_from_exif(source: str | Path | None, width: int | None, height: int 
         f"{photo}: the EXIF data give {exif.focal_length_mm:g} mm but no 35 mm equivalent, and the sensor of "
         f"'{exif.model}' is not known; give a camera file or fov:DEG"
     )
-
-
-def _first_photo(source: Path) -> Path:
-    if source.is_file():
-        candidates = [source]
-    elif source.is_dir():
-        candidates = sorted(source.iterdir())
-    else:
-        candidates = sorted(source.parent.glob(source.name)) if source.parent.is_dir() else []
-    photos = [path for path in candidates if path.suffix.lower() in PHOTO_SUFFIXES | HEIF_SUFFIXES]
-    if not photos:
-        raise InputError(
-            f"{source}: no photo with EXIF data there (a video holds no focal length); give a camera file or fov:DEG"
-        )
-    return photos[0]

@@ -32,7 +32,7 @@ class _Kind(StrEnum):
 
 
 _KINDS = {
-    _Kind.ANY: ("", "pinhole", "simplepinhole", "perspective", "opencv", "fullopencv", "standard"),
+    _Kind.ANY: ("", "pinhole", "simplepinhole", "perspective", "opencv", "fullopencv", "standard", "rectified"),
     _Kind.NONE: ("none", "nodistortion"),
     _Kind.BROWN: (
         "plumbbob",

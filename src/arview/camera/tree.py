@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Hashable
+from collections.abc import Iterable
 from typing import Any
 from xml.etree import ElementTree
 
@@ -34,14 +34,19 @@ class _Loader(SafeLoader):
     """YAML's safe reader, with OpenCV's tags and without a second value for a key."""
 
 
-def _map(loader: Any, node: Any, deep: bool = True) -> dict[str, Any]:
+def _once(pairs: Iterable[tuple[Any, Any]]) -> dict[str, Any]:
+    """A map of keys that each occur once."""
     content: dict[str, Any] = {}
-    for key_node, value_node in node.value:
-        key = loader.construct_object(key_node, deep=True)
-        if not isinstance(key, Hashable) or str(key) in content:
+    for key, value in pairs:
+        if str(key) in content:
             raise InputError(f"holds {str(key)[:40]} twice; keep one of them")
-        content[str(key)] = loader.construct_object(value_node, deep=True)
+        content[str(key)] = value
     return content
+
+
+def _map(loader: Any, node: Any, deep: bool = True) -> dict[str, Any]:
+    build = loader.construct_object
+    return _once((build(key, deep=True), build(value, deep=True)) for key, value in node.value)
 
 
 def _text(loader: Any, node: Any) -> str:
@@ -67,7 +72,7 @@ def parse_trees(text: str) -> list[Any]:
         if text.startswith(("{", "[")):
             return [_from_json(text)]
         if text.startswith("<"):
-            return [_from_xml(text)]
+            return [_from_element(parse_xml(text))]
         return _from_yaml(text)
     except RecursionError as error:
         raise InputError("is nested too deeply for a camera file; export it again") from error
@@ -96,19 +101,10 @@ def numbers_of(value: Any, key: str) -> list[float]:
 
 
 def _from_json(text: str) -> Any:
-    def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        content = dict(pairs)
-        if len(content) != len(pairs):
-            twice = next(key for key, _ in pairs if sum(key == other for other, _ in pairs) > 1)
-            raise InputError(f"holds {twice[:40]} twice; keep one of them")
-        return content
-
     try:
-        return json.loads(text, object_pairs_hook=once)
-    except json.JSONDecodeError as error:
-        raise InputError(f"is not valid JSON (line {error.lineno}: {error.msg}); correct or export it again") from error
-    except ValueError as error:  # a number of thousands of digits
-        raise InputError(f"is not valid JSON ({str(error)[:60]}); correct or export it again") from error
+        return json.loads(text, object_pairs_hook=_once)
+    except ValueError as error:  # also a number of thousands of digits
+        raise InputError(f"is not valid JSON ({str(error)[:100]}); correct or export it again") from error
 
 
 def _from_yaml(text: str) -> list[Any]:
@@ -169,13 +165,18 @@ def _from_ini(text: str) -> Any:
     return {key: size | value for key, value in sections.items()}
 
 
-def _from_xml(text: str) -> Any:
+def parse_xml(text: str) -> ElementTree.Element:
+    """The root of an XML text.
+
+    Raises:
+        InputError: it is broken, or defines entities, which can make few bytes many.
+    """
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise InputError(
             "the XML defines entities or a document type, which a camera file never needs; export it again"
         )
     try:
-        return _from_element(ElementTree.fromstring(text))
+        return ElementTree.fromstring(text)
     except ElementTree.ParseError as error:
         raise InputError(f"is not valid XML ({error}); export it again") from error
 
@@ -186,12 +187,7 @@ def _from_element(element: ElementTree.Element) -> Any:
         return _value(element.text or "")
     if all(child.tag == "_" for child in children):
         return [_from_element(child) for child in children]
-    content: dict[str, Any] = {}
-    for child in children:
-        if child.tag in content:
-            raise InputError(f"holds {child.tag[:40]} twice; keep one of them")
-        content[child.tag] = _from_element(child)
-    return content
+    return _once((child.tag, _from_element(child)) for child in children)
 
 
 def _value(text: str) -> Any:

@@ -33,7 +33,7 @@ def write_camera(
         OutputError: the file cannot be written.
     """
     path = Path(path)
-    kind = kind or format_of(path)
+    kind = kind or format_and_path(str(path))[0]
     if kind not in FORMATS:
         raise InputError(f"camera format {kind!r}: expected one of {', '.join(FORMATS)}")
     if camera.lens is not None and not _holds(kind, camera.lens):
@@ -42,6 +42,7 @@ def write_camera(
     write_file(path, text.encode())
 
 
+_FORMAT_OF_SUFFIX = {".json": "arview", ".txt": "colmap", ".xml": "opencv-xml", ".yaml": "opencv", ".yml": "opencv"}
 _LENSES: dict[str, tuple[LensModel, ...]] = {
     "bop": (),
     "opencv": (LensModel.RATIONAL, LensModel.FISHEYE),
@@ -66,17 +67,19 @@ def _holds(kind: str, lens: LensDistortion) -> bool:
     return lens.model in _LENSES.get(kind, tuple(LensModel)) and not (kind == "colmap" and has_prism)
 
 
-def format_of(path: Path) -> str:
-    """The format for the suffix of a file name.
+def format_and_path(text: str) -> tuple[str, str]:
+    """Format and file of ``FORMAT:FILE``, or of a file name, whose suffix chooses the format.
 
     Raises:
         InputError: the suffix has none.
     """
-    kinds = {".json": "arview", ".txt": "colmap", ".xml": "opencv-xml", ".yaml": "opencv", ".yml": "opencv"}
-    kind = kinds.get(path.suffix.lower())
-    if kind is None:
-        raise InputError(f"{path}: expected .json, .yaml, .xml or .txt, or FORMAT:FILE with {', '.join(FORMATS)}")
-    return kind
+    kind, colon, path = text.partition(":")
+    if colon and kind in FORMATS:
+        return kind, path
+    found = _FORMAT_OF_SUFFIX.get(Path(text).suffix.lower())
+    if found is None:
+        raise InputError(f"{text}: expected .json, .yaml, .xml or .txt, or FORMAT:FILE with {', '.join(FORMATS)}")
+    return found, text
 
 
 def holds_distortion(kind: str) -> bool:
@@ -105,16 +108,8 @@ def _arview(camera: Camera, extra: dict[str, Any] | None = None) -> str:
 
 
 def _bop(camera: Camera) -> str:
-    record = {
-        "cx": float(camera.cx),
-        "cy": float(camera.cy),
-        "depth_scale": 1.0,
-        "fx": float(camera.fx),
-        "fy": float(camera.fy),
-        "height": camera.height,
-        "width": camera.width,
-    }
-    return json.dumps(record, indent=2) + "\n"
+    record = {key: value for key, value in camera_record(camera).items() if key != "dist"} | {"depth_scale": 1.0}
+    return json.dumps(record, indent=2, sort_keys=True) + "\n"
 
 
 def _opencv(suffix: str) -> Callable[[Camera], str]:

@@ -158,14 +158,14 @@ def lens(
     anyway: bool,
 ) -> None:
     """Calibrate the camera that took PHOTOS (files, folders, globs), or VIDEO, of a ChArUco board."""
-    from arview.camera import holds_distortion, profile_name, profile_path, write_camera
+    from arview.camera import format_and_path, holds_distortion, profile_name, profile_path, write_camera
     from arview.fiducials import parse_board
 
     if not outputs and profile is None:
         raise InputError("nothing to write: give -o camera.json or --profile")
     targets: list[tuple[str, Path]] = []
     for text in outputs:
-        kind, name = _format_and_path(text)
+        kind, name = format_and_path(text)
         targets.append((kind, output_path(name, [*sources, *(other for _, other in targets)])))
     picture = None if plot is None else output_path(plot, [*sources, *(path for _, path in targets)])
     if picture is not None:
@@ -223,15 +223,6 @@ def profiles() -> None:
         words = [one.lens.get("make"), one.lens.get("model"), f"{one.lens.get('width')}×{one.lens.get('height')}"]
         click.echo(f"{one.name:40} {' '.join(str(word) for word in words if word)}")
     click.echo(f"{len(found)} profile{'' if len(found) == 1 else 's'} in {profile_folder()}")
-
-
-def _format_and_path(text: str) -> tuple[str, str]:
-    from arview.camera import FORMATS, format_of
-
-    kind, colon, path = text.partition(":")
-    if colon and kind in FORMATS:
-        return kind, path
-    return format_of(Path(text)), text
 
 
 def _parse_squares(text: str | None) -> tuple[int | None, int | None]:

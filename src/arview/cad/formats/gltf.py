@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import struct
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from arview.cad.formats import draco
 from arview.cad.formats.gltf_data import GltfData
-from arview.cad.formats.raw import RawComponent, RawModel, check_instance_count, check_triangle_count, place, unit_in_mm
+from arview.cad.formats.raw import RawComponent, RawModel, check_instance_count, check_triangle_count, unit_in_mm
 from arview.errors import InputError
 from arview.geometry import Array
 
@@ -64,15 +64,6 @@ def srgb_from_linear(linear: Array) -> Array:
     return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.power(x, 1 / 2.4) - 0.055)
 
 
-@dataclass(frozen=True)
-class _GltfMesh:
-    """Vertices (V,3) and faces (F,3) of a mesh in its own frame, and its colour."""
-
-    vertices: Array
-    faces: NDArray[np.int64]
-    color: Color | None
-
-
 class _Gltf:
     """Reader of one file."""
 
@@ -103,7 +94,7 @@ class _Gltf:
         _check_extensions(self.tree, path)
         self.data = GltfData(self.tree, self.binary, path)
         self.model = RawModel(unit_mm=1000.0)
-        self.meshes: dict[int, _GltfMesh | None] = {}
+        self.meshes: dict[int, RawComponent | None] = {}
         self.visit_count = 0
 
     def read(self) -> RawModel:
@@ -162,18 +153,16 @@ class _Gltf:
         rows = zip(*columns.values(), strict=True)
         return [_node_matrix(dict(zip(columns, (value.astype(float) for value in row), strict=True))) for row in rows]
 
-    def _add(self, mesh: _GltfMesh, root_from_mesh: Array, path: tuple[str, ...]) -> None:
-        check_triangle_count(self.model.triangle_count + len(mesh.faces), self.path)
-        placed, turned = place(root_from_mesh, mesh.vertices, mesh.faces)
-        self.model.add(RawComponent(tuple(n for n in path if n), placed, turned, mesh.color), self.path)
+    def _add(self, mesh: RawComponent, root_from_mesh: Array, path: tuple[str, ...]) -> None:
+        self.model.add(replace(mesh, path=tuple(name for name in path if name)), self.path, root_from_mesh)
 
-    def _mesh(self, index: int, path: tuple[str, ...]) -> _GltfMesh | None:
-        """The triangles of a mesh, read once however often it is used; None when it has none."""
+    def _mesh(self, index: int, path: tuple[str, ...]) -> RawComponent | None:
+        """The triangles of a mesh in its own frame, read once however often it is used; None when it has none."""
         if index not in self.meshes:
             self.meshes[index] = self._read_mesh(index, path)
         return self.meshes[index]
 
-    def _read_mesh(self, index: int, path: tuple[str, ...]) -> _GltfMesh | None:
+    def _read_mesh(self, index: int, path: tuple[str, ...]) -> RawComponent | None:
         vertices: list[Array] = []
         faces: list[NDArray[np.int64]] = []
         area_of_color: dict[Color, float] = {}
@@ -207,7 +196,7 @@ class _Gltf:
         points = np.concatenate(vertices)
         if len(used) < len(points) and not np.isfinite(points).all():
             raise ValueError(f"vertices of {'/'.join(path)!r} are NaN or infinite")
-        return _GltfMesh(points[used], corners.reshape(-1, 3), color)
+        return RawComponent((), points[used], corners.reshape(-1, 3), color)
 
     def _corners(self, primitive: dict[str, Any], count: int) -> NDArray[np.int64]:
         """Vertex indices of a primitive; all vertices in order where it has none."""
@@ -263,13 +252,9 @@ def _node_matrix(node: dict[str, Any]) -> Array:
         return np.array(node["matrix"], dtype=np.float64).reshape(4, 4).T
     matrix = np.eye(4)
     if "rotation" in node:
-        quaternion = np.array(node["rotation"], dtype=np.float64)
-        x, y, z, w = quaternion / np.linalg.norm(quaternion)
-        matrix[:3, :3] = [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
+        from scipy.spatial.transform import Rotation  # takes a quarter of a second to import
+
+        matrix[:3, :3] = Rotation.from_quat(node["rotation"]).as_matrix()
     matrix[:3, :3] = matrix[:3, :3] * np.array(node.get("scale", [1.0, 1.0, 1.0]), dtype=np.float64)
     matrix[:3, 3] = node.get("translation", [0.0, 0.0, 0.0])
     return matrix

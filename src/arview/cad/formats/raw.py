@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from unicodedata import category
 
@@ -66,11 +67,25 @@ class RawModel:
     triangle_count: int = 0
     up: Up = "z"
 
-    def add(self, component: RawComponent, path: Path) -> None:
-        """Append a component; raises InputError beyond MAX_TRIANGLES."""
-        self.triangle_count += len(component.faces)
+    def add(self, component: RawComponent, path: Path, root_from_mesh: Array | None = None) -> None:
+        """Append a component, placed by an affine transform (4,4); a reflection reverses the winding of its faces.
+
+        Raises:
+            InputError: a triangle refers to a vertex that does not exist, or beyond MAX_TRIANGLES.
+        """
+        vertices, faces = component.vertices, component.faces
+        self.triangle_count += len(faces)
         check_triangle_count(self.triangle_count, path)
-        self.components.append(component)
+        if len(faces) and not 0 <= faces.min() <= faces.max() < len(vertices):
+            name = "/".join(component.path) or path.stem
+            raise InputError(
+                f"{path}: broken: a triangle of {name!r} refers to a vertex that does not exist; export it again"
+            )
+        if root_from_mesh is not None:
+            if np.linalg.det(root_from_mesh[:3, :3]) < 0:
+                faces = faces[:, ::-1]
+            vertices = vertices @ root_from_mesh[:3, :3].T + root_from_mesh[:3, 3]
+        self.components.append(replace(component, vertices=vertices, faces=faces))
         check_instance_count(len(self.components), path)
 
 
@@ -96,20 +111,8 @@ def unit_in_mm(name: str) -> float | None:
     """Length in mm of a unit by its name in a file; None when the name is unknown."""
     key = name.strip().lower()
     singular = key[:-1] if key.endswith("s") else key
-    for candidate in (key, singular):
-        if candidate in UNIT_MM:
-            return UNIT_MM[candidate]
-        if candidate in _ALIASES_MM:
-            return _ALIASES_MM[candidate]
-    return None
-
-
-def place(parent_from_mesh: Array, vertices: Array, faces: NDArray[np.int64]) -> tuple[Array, NDArray[np.int64]]:
-    """Apply an affine transform (4,4) to vertices (V,3); a reflection reverses the winding of the faces."""
-    placed = vertices @ parent_from_mesh[:3, :3].T + parent_from_mesh[:3, 3]
-    if np.linalg.det(parent_from_mesh[:3, :3]) < 0:
-        faces = faces[:, ::-1]
-    return placed, faces
+    known = UNIT_MM | _ALIASES_MM
+    return known.get(key, known.get(singular))
 
 
 def _printable(name: str) -> str:
@@ -117,6 +120,11 @@ def _printable(name: str) -> str:
     if name.isprintable():
         return name
     return "".join(" " if category(letter) in ("Cc", "Zl", "Zp") else letter for letter in name).strip()
+
+
+def short_list(names: Sequence[str]) -> str:
+    """The first four names, and how many there are besides."""
+    return ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
 
 
 def unique_names(paths: list[tuple[str, ...]], fallback: str) -> tuple[list[str], list[str]]:
@@ -135,20 +143,13 @@ def unique_names(paths: list[tuple[str, ...]], fallback: str) -> tuple[list[str]
     for i, name in enumerate(names):
         indices.setdefault(name, []).append(i)
     for name, same in indices.items():
-        if len(same) == 1:
-            continue
-        deepest = max(len(paths[i]) for i in same)
-        candidates = [name] * len(same)
-        for depth in range(2, deepest + 1):
-            candidates = ["/".join(paths[i][-depth:]) for i in same]
-            if len(set(candidates)) == len(candidates):
-                break
-        else:
-            candidates = [name] * len(same)
-        for i, candidate in zip(same, candidates, strict=True):
-            names[i] = candidate
-        if any(candidate != name for candidate in candidates):
+        deepest = max(len(paths[i]) for i in same) if len(same) > 1 else 0
+        by_depth = (["/".join(paths[i][-depth:]) for i in same] for depth in range(2, deepest + 1))
+        candidates = next((longer for longer in by_depth if len(set(longer)) == len(longer)), None)
+        if candidates is not None:
             notes.append(f"{len(same)} components are named {name!r}: called {', '.join(candidates[:4])}")
+            for i, candidate in zip(same, candidates, strict=True):
+                names[i] = candidate
     taken: set[str] = set()
     given = set(names)
     last_number: dict[str, int] = {}
@@ -164,9 +165,6 @@ def unique_names(paths: list[tuple[str, ...]], fallback: str) -> tuple[list[str]
         taken.add(unique)
         names[i] = unique
     for name, others in renamed.items():
-        if len(others) == 1:
-            notes.append(f"another component is named {name!r}: called {others[0]}")
-        else:
-            rest = f" and {len(others) - 4} more" if len(others) > 4 else ""
-            notes.append(f"{len(others)} more components are named {name!r}: called {', '.join(others[:4])}{rest}")
+        which = f"{len(others)} more components are" if len(others) > 1 else "another component is"
+        notes.append(f"{which} named {name!r}: called {short_list(others)}")
     return names, notes

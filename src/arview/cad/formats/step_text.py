@@ -7,7 +7,6 @@ however many named solids that has. Both are dealt with before it reads the file
 from __future__ import annotations
 
 import re
-from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -103,17 +102,13 @@ def products_without_shape(data: bytes) -> list[str]:
         return []
     parents = {parent for parent, _ in uses}
     placements = {m[1] for m in _PLACEMENT.finditer(data)}
-    linked = {one for m in _SAME_SHAPE.finditer(data) for one in (m[2], m[3])}
+    products = _Products(data)
     items = {m[1]: set(re.findall(rb"\d+", m[3])) for m in _SHAPE.finditer(data)}
     # A representation of nothing but its own frame stands for a shape in another file.
-    empty = {one for one, held in items.items() if held <= placements and one not in linked}
-    definition_of_property = {m[1]: m[3] for m in _DEFINITION_SHAPE.finditer(data)}
-    without_shape = {definition_of_property.get(m[1]) for m in _SHAPE_OF.finditer(data) if m[2] in empty}
-    formation = {m[1]: m[3] for m in _DEFINITION.finditer(data)}
-    product = {m[1]: m[3] for m in _FORMATION.finditer(data)}
-    name = {m[1]: m[3] for m in _PRODUCT.finditer(data)}
+    empty = {one for one, held in items.items() if held <= placements and one not in products.linked}
+    without_shape = {products.definition.get(m[1]) for m in _SHAPE_OF.finditer(data) if m[2] in empty}
     missing = dict.fromkeys(child for _, child in uses if child not in parents and child in without_shape)
-    texts = [name.get(product.get(formation.get(one, b""), b""), b"'#" + one + b"'") for one in missing]
+    texts = [products.name_of(one) for one in missing]
     return [text[1:-1].decode("utf-8", errors="replace") for text in texts]
 
 
@@ -165,13 +160,13 @@ def split_solids(data: bytes) -> bytes:
     shapes = [(match, items) for match, items in shapes if len({_plain_name(solids[i]) for i in items}) > 1]
     if not shapes:
         return data
-    owners = _Owners(data)
+    products = _Products(data)
     new_id = 1 + max(int(i) for i in re.findall(rb"#(\d+)\s*=", data))
     pieces: list[bytes] = []
     added: list[bytes] = []
     end = 0
     for match, items in shapes:
-        owner = owners.of_shape(match[1])
+        owner = products.of_shape(match[1])
         if owner is None:
             continue
         definition, shape, definition_context, product_context, product_name = owner
@@ -233,8 +228,8 @@ def _product_of_solid(
     ]
 
 
-class _Owners:
-    """The product definition that a shape representation belongs to, and what a new product needs of it."""
+class _Products:
+    """The products of a file by the numbers of their definitions and shape representations."""
 
     def __init__(self, data: bytes) -> None:
         self.definition_of_shape = {m[2]: m[1] for m in _SHAPE_OF.finditer(data)}
@@ -245,10 +240,17 @@ class _Owners:
         self.formation = {m[1]: (m[3], m[4]) for m in _DEFINITION.finditer(data)}
         self.product = {m[1]: m[3] for m in _FORMATION.finditer(data)}
         self.name = {m[1]: (m[3], m[4]) for m in _PRODUCT.finditer(data)}
-        self.uses = Counter(self.definition_of_shape)
+
+    def name_of(self, definition: bytes) -> bytes:
+        """Name of a product in quotes; its number where it is not found."""
+        formation, _ = self.formation.get(definition, (b"", b""))
+        return self.name.get(self.product.get(formation, b""), (b"'#" + definition + b"'", b""))[0]
 
     def of_shape(self, shape: bytes) -> tuple[bytes, bytes, bytes, bytes, bytes] | None:
-        """Definition, its own representation, its context, and the product's context and name; None when not found."""
+        """Definition, its own representation, its context, and the product's context and name; None when not found.
+
+        They are what a new product that is placed in it needs.
+        """
         if shape not in self.definition_of_shape:
             shape = self.linked.get(shape, shape)
         try:

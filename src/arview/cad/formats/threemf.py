@@ -11,12 +11,11 @@ import posixpath
 import zipfile
 from array import array
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from pathlib import Path
 from xml.parsers import expat
 
 import numpy as np
-from numpy.typing import NDArray
 
 from arview.cad.formats.raw import (
     MAX_TRIANGLES,
@@ -24,7 +23,6 @@ from arview.cad.formats.raw import (
     RawModel,
     check_instance_count,
     check_triangle_count,
-    place,
     unit_in_mm,
 )
 from arview.errors import InputError
@@ -45,10 +43,8 @@ class _Object:
     """An object resource: a mesh, or references to others with transforms, or both."""
 
     name: str
-    vertices: Array
-    faces: NDArray[np.int64]
-    color: Color | None
-    children: list[tuple[Key, Array]] = field(default_factory=list)
+    mesh: RawComponent
+    children: list[tuple[Key, Array]]
 
 
 def read_3mf(path: Path) -> RawModel:
@@ -157,11 +153,8 @@ class _Archive:
     def _instantiate(self, key: Key, root_from_object: Array, path: tuple[str, ...], name: str | None) -> None:
         this = self.objects[key]
         here = (*path, name or this.name)
-        if len(this.faces):
-            check_triangle_count(self.model.triangle_count + len(this.faces), self.path)
-            placed, turned = place(root_from_object, this.vertices, this.faces)
-            component = RawComponent(tuple(n for n in here if n), placed, turned, this.color)
-            self.model.add(component, self.path)
+        if len(this.mesh.faces):
+            self.model.add(replace(this.mesh, path=tuple(n for n in here if n)), self.path, root_from_object)
         for child, object_from_child in this.children:
             self._instantiate(child, root_from_object @ object_from_child, here, None)
 
@@ -222,15 +215,11 @@ class _ModelPart:
             return
         vertices = np.array(self.points, dtype=np.float64).reshape(-1, 3)
         faces = np.array(self.corners, dtype=np.int64).reshape(-1, 3)
-        if len(faces) and not 0 <= faces.min() <= faces.max() < len(vertices):
-            raise ValueError(f"a triangle of object {attributes['id']} refers to a vertex that does not exist")
         group, index = max(self.uses, key=lambda key: self.uses[key]) if self.uses else (None, None)
         color = self.colors[group][int(index or 0)] if group in self.colors else None
         self.archive.objects[self.name, attributes["id"]] = _Object(
             name=attributes.get("name") or attributes.get("partnumber") or "",
-            vertices=vertices,
-            faces=faces,
-            color=color,
+            mesh=RawComponent((), vertices, faces, color),
             children=self.children,
         )
         self._clear()

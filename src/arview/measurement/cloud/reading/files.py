@@ -1,4 +1,4 @@
-"""Reading a cloud by its format: PLY and PCD by Open3D, LAS and LAZ by laspy, E57 by pye57, text by `text`.
+"""Reading a cloud by its format: PLY by NumPy, PCD by Open3D, LAS and LAZ by laspy, E57 by pye57, text by `text`.
 
 Headers are checked against the size of the file first, so that a damaged one cannot make a library allocate memory
 without end.
@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -24,13 +24,21 @@ MAX_HEADER_BYTES = 65_536
 CHUNK_POINTS = 2_000_000
 """Points of a LAS file that are decoded at a time."""
 
-_SIZES = {
-    **dict.fromkeys(("char", "uchar", "int8", "uint8"), 1),
-    **dict.fromkeys(("short", "ushort", "int16", "uint16"), 2),
-    **dict.fromkeys(("int", "uint", "float", "int32", "uint32", "float32"), 4),
-    **dict.fromkeys(("double", "float64", "int64", "uint64"), 8),
+_TYPES = {
+    **{name: name for name in ("int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "uint64")},
+    "char": "int8",
+    "uchar": "uint8",
+    "short": "int16",
+    "ushort": "uint16",
+    "int": "int32",
+    "uint": "uint32",
+    "float": "float32",
+    "float32": "float32",
+    "double": "float64",
+    "float64": "float64",
 }
-"""Bytes of the types of PLY properties."""
+"""NumPy's types by the names of the types of PLY properties."""
+_BYTE_ORDERS: dict[str, Literal["=", "<", ">"]] = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 
 def read_points(path: str | Path) -> RawPoints:
@@ -52,42 +60,59 @@ def read_points(path: str | Path) -> RawPoints:
         raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
     if not start:
         raise InputError(f"{path}: is empty")
-    for magic, read in ((b"ply", _read_ply), (b"LASF", _read_las), (b"ASTM-E57", _read_e57)):
-        if start.startswith(magic):
-            return read(path)
-    read_suffix = SUFFIXES.get(path.suffix.lower())
-    if read_suffix is None:
+    by_suffix = READERS.get(path.suffix.lower())
+    read = next((read for signature, read in SIGNATURES.items() if start.startswith(signature)), by_suffix)
+    if read is None:
         raise InputError(f"{path}: is no known format of a cloud; expected {', '.join(SUFFIXES)}")
-    if read_suffix in (_read_ply, _read_las, _read_e57):
+    if read is by_suffix and read in SIGNATURES.values() and not start.startswith(tuple(SIGNATURES)):
         raise InputError(f"{path}: is not a {path.suffix[1:].upper()} file with points")
-    return read_suffix(path)
+    return read(path)
 
 
 def _read_ply(path: Path) -> RawPoints:
-    """A PLY file by Open3D, after its header was checked."""
+    """The vertices of a PLY file, which must be its first element."""
     header = _header(path, b"end_header")
-    size = path.stat().st_size - len(header)
-    kind, count, element, record, names = "", -1, "", 0, []
+    kind, count, elements, types = "", 0, [""], {}
     for words in (line.split() for line in header.splitlines()):
         if words[:1] == ["format"] and len(words) > 1:
             kind = words[1]
         elif words[:1] == ["element"] and len(words) == 3:
-            element = words[1]
-            count = _integer(path, words[2]) if element == "vertex" else count
-        elif words[:1] == ["property"] and element == "vertex":
-            if len(words) != 3 or words[1] not in _SIZES:
+            elements.append(words[1])
+            count = _integer(path, words[2]) if words[1] == "vertex" else count
+        elif words[:1] == ["property"] and elements[-1] == "vertex":
+            if len(words) != 3 or words[1] not in _TYPES or words[2] in types:
                 raise InputError(f"{path}: is not a PLY file with points (property {' '.join(words[1:])!r})")
-            record += _SIZES[words[1]]
-            names.append(words[2])
-    if count < 0 or not {"x", "y", "z"} <= set(names) or not kind:
+            types[words[2]] = _TYPES[words[1]]
+    if elements[1:2] != ["vertex"] or not set("xyz") <= set(types) or kind not in _BYTE_ORDERS:
         raise InputError(f"{path}: is not a PLY file with points")
+    record = np.dtype(list(types.items())).newbyteorder(_BYTE_ORDERS[kind])
+    _check_size(path, count, len(header), 2 * len(types) if kind == "ascii" else record.itemsize)
+    columns: Any = np.zeros(count, dtype=record)
+    if kind != "ascii":
+        columns = np.fromfile(path, dtype=record, count=count, offset=len(header))
+    elif count:
+        with path.open("rb") as file:
+            file.seek(len(header))
+            try:
+                values = np.loadtxt(file, max_rows=count, ndmin=2, comments=None, encoding="latin-1")
+            except ValueError as error:
+                raise InputError(f"{path}: is truncated or damaged ({str(error).split(';')[0]})") from error
+        if values.shape != (count, len(types)):
+            raise InputError(f"{path}: is truncated: its header names {count} points, and it has {len(values)} lines")
+        columns = {name: values[:, index].astype(types[name]) for index, name in enumerate(types)}
+    normal = ("nx", "ny", "nz")
+    normals = np.stack([columns[name] for name in normal], axis=1) if set(normal) <= set(types) else None
+    collector = PointCollector(path)
+    collector.add(np.stack([columns[axis] for axis in "xyz"], axis=1), normals)
+    return collector.result()
+
+
+def _check_size(path: Path, count: int, header_bytes: int, least: int) -> None:
+    """Raise InputError for too many points, or a file that is too short for those that its header names."""
     check_count(path, count)
-    least = 2 * len(names) if kind == "ascii" else record
+    size = path.stat().st_size - header_bytes
     if count * least > size:
         raise InputError(f"{path}: is truncated: its header names {count} points, {size} bytes follow")
-    if kind == "ascii":
-        _check_lines(path, count)
-    return _by_open3d(path, count)
 
 
 def _read_pcd(path: Path) -> RawPoints:
@@ -101,7 +126,6 @@ def _read_pcd(path: Path) -> RawPoints:
     repeats = [_integer(path, word) for word in fields.get("COUNT", ["1"] * len(sizes))]
     if len(sizes) != len(fields["FIELDS"]) or len(repeats) != len(sizes):
         raise InputError(f"{path}: its PCD header is damaged")
-    check_count(path, count)
     kind, size = (fields.get("DATA") or [""])[0], path.stat().st_size - len(header)
     record = sum(a * b for a, b in zip(sizes, repeats, strict=True))
     least = {"ascii": 2 * sum(repeats), "binary": record}.get(kind, 0)
@@ -113,25 +137,12 @@ def _read_pcd(path: Path) -> RawPoints:
             raise InputError(f"{path}: is truncated or damaged")
     elif kind not in ("ascii", "binary"):
         raise InputError(f"{path}: PCD data {kind!r}, expected ascii, binary or binary_compressed")
-    if count * least > size:
-        raise InputError(f"{path}: is truncated: its header names {count} points, {size} bytes follow")
-    if kind == "ascii":
-        _check_lines(path, count)
-    return _by_open3d(path, count)
-
-
-def _check_lines(path: Path, count: int) -> None:
-    """Raise InputError when a text file has fewer lines than points: the reader would fill up with zeros."""
-    lines = 0
-    with path.open("rb") as file:
-        while block := file.read(BLOCK_BYTES):
-            lines += block.count(b"\n")
-    if lines < count:
-        raise InputError(f"{path}: is truncated: its header names {count} points, and it has {lines} lines")
-
-
-def _by_open3d(path: Path, count: int) -> RawPoints:
-    """Points and normals of a file whose header was checked, as Open3D reads them."""
+    _check_size(path, count, len(header), least)
+    if kind == "ascii":  # Open3D would fill up with zeros
+        with path.open("rb") as file:
+            lines = sum(block.count(b"\n") for block in iter(lambda: file.read(BLOCK_BYTES), b""))
+        if lines < count:
+            raise InputError(f"{path}: is truncated: its header names {count} points, and it has {lines} lines")
     o3d = load_open3d()
     try:
         with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
@@ -140,14 +151,11 @@ def _by_open3d(path: Path, count: int) -> RawPoints:
         normals = cloud.point.normals.numpy() if "normals" in cloud.point else None
     except Exception as error:  # a damaged file may make the reader raise anything
         reason = str(error).split("\n")[0].split("): ")[-1][:200]
-        raise InputError(f"{path}: is not a {path.suffix[1:].upper()} file with points ({reason})") from error
+        raise InputError(f"{path}: is not a PCD file with points ({reason})") from error
     if len(points) != count:
         raise InputError(f"{path}: is truncated: its header names {count} points, {len(points)} could be read")
     collector = PointCollector(path)
-    for start in range(0, len(points), CHUNK_POINTS):
-        part = slice(start, start + CHUNK_POINTS)
-        collector.add(points[part], None if normals is None else normals[part])
-    del cloud, points, normals
+    collector.add(points, normals)
     return collector.result()
 
 
@@ -215,16 +223,14 @@ def _integer(path: Path, word: str) -> int:
     return int(word)
 
 
-SUFFIXES: dict[str, Callable[[Path], RawPoints]] = {
+SIGNATURES: dict[bytes, Callable[[Path], RawPoints]] = {b"ply": _read_ply, b"LASF": _read_las, b"ASTM-E57": _read_e57}
+"""Readers by the first bytes of a file, which decide before its suffix does."""
+READERS: dict[str, Callable[[Path], RawPoints]] = {
     ".ply": _read_ply,
     ".pcd": _read_pcd,
-    ".xyz": read_text,
-    ".pts": read_text,
-    ".csv": read_text,
-    ".txt": read_text,
-    ".asc": read_text,
-    ".las": _read_las,
-    ".laz": _read_las,
+    **dict.fromkeys((".xyz", ".pts", ".csv", ".txt", ".asc"), read_text),
+    **dict.fromkeys((".las", ".laz"), _read_las),
     ".e57": _read_e57,
 }
 """Readers by suffix."""
+SUFFIXES = tuple(READERS)

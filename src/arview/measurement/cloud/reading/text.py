@@ -6,8 +6,8 @@ a few damaged lines are left out and counted, and a file full of them is refused
 
 from __future__ import annotations
 
+import io
 import re
-import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -112,48 +112,25 @@ def _blocks(path: Path, file: BinaryIO, layout: _Layout) -> Iterator[bytes]:
     for _ in range(layout.skipped):
         file.readline(_MAX_LINE)
     rest = b""
-    while True:
-        read = file.read(BLOCK_BYTES)
+    while read := file.read(BLOCK_BYTES):
         block = rest + read
-        if not read:  # what is left is the last line
-            if len(block) > _MAX_LINE:
-                raise InputError(f"{path}: has a line of more than {_MAX_LINE} characters; it is not a cloud")
-            if block.strip():
-                yield block.translate(layout.table)
-            return
         end = block.rfind(b"\n") + 1 or block.rfind(b"\r") + 1
-        if end == 0:
-            if len(block) > _MAX_LINE:
-                raise InputError(f"{path}: has a line of more than {_MAX_LINE} characters; it is not a cloud")
-            rest = block
-            continue
         rest = block[end:]
+        if len(rest) > _MAX_LINE:
+            raise InputError(f"{path}: has a line of more than {_MAX_LINE} characters; it is not a cloud")
         yield block[:end].translate(layout.table)
+    yield rest.translate(layout.table)  # the last line
 
 
 def _parse_block(block: bytes, columns: int) -> Array | None:
     """(N,columns) numbers of a block, or None if a line does not have as many."""
-    codes = np.frombuffer(block, dtype=np.uint8)
-    is_end = codes == 10
-    is_gap = is_end | (codes == 32)
-    starts = ~is_gap
-    starts[1:] &= is_gap[:-1]
-    ends = np.cumsum(starts, dtype=np.int64)[is_end]
-    fields = np.diff(ends, prepend=0)
-    if not is_end[-1:].all():
-        fields = np.append(fields, int(starts.sum()) - (int(ends[-1]) if len(ends) else 0))
-    fields = fields[fields > 0]
-    if len(fields) == 0:
+    if not block.strip():
         return np.zeros((0, columns))
-    if (fields != columns).any():
+    try:
+        values = np.loadtxt(io.BytesIO(block), comments=None, ndmin=2, encoding="latin-1")
+    except ValueError:
         return None
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        try:
-            values = np.fromstring(block.decode("latin-1"), dtype=np.float64, sep=" ")
-        except (ValueError, DeprecationWarning):
-            return None
-    return values.reshape(-1, columns) if len(values) == columns * len(fields) else None
+    return values if values.shape[1] == columns else None
 
 
 def _parse_lines(block: bytes, columns: int) -> tuple[Array, int, str]:
