@@ -131,6 +131,7 @@ class VisibleEdgeCache:
             faces=mesh.faces[is_kept],
             is_crease=mesh.is_crease[is_kept],
             is_sharp=mesh.is_sharp[is_kept],
+            is_rough=mesh.is_rough[is_kept],
             component=mesh.component[is_kept],
         )
         found = self._sampled(view_pose, replace(drawn, component_ids=names[drawn.component_ids]), left)

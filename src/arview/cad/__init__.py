@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from arview.cad.load import LoadedCad as LoadedCad
     from arview.cad.load import load_cad as load_cad
     from arview.cad.load import load_model as load_model
+    from arview.cad.mesh_topology import EdgeFaces as EdgeFaces
     from arview.cad.mesh_topology import edge_faces as edge_faces
     from arview.cad.model import Component as Component
     from arview.cad.model import Model as Model
@@ -56,7 +57,7 @@ __getattr__, __dir__, __all__ = lazy_door(
             "load_cad",
             "load_model",
         ),
-        "mesh_topology": ("edge_faces",),
+        "mesh_topology": ("EdgeFaces", "edge_faces"),
         "model": (
             "Component",
             "Model",

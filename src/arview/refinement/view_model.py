@@ -17,7 +17,7 @@ from arview.geometry import invert, rigid
 from arview.guideviews import GuideViewSet
 from arview.refinement.modalities.shading import corner_normals, curved_share
 from arview.refinement.projection import ViewArrays
-from arview.rendering import EDGE_CONTOUR, EDGE_SHARP
+from arview.rendering import EDGE_CONTOUR, EDGE_ROUGH, EDGE_SHARP
 
 MIN_SEPARATION = 0.035
 """Edges closer to each other than this, in diameters of the part, are unresolvable: 3.4 px where the diameter is 96 px,
@@ -46,6 +46,7 @@ class PartView:
         arrays: the guide views, see `ViewArrays`.
         model_from_body, body_from_model: (4,4) translations between the frames of model and body.
         surface: reduced mesh of the part.
+        design_share: share of design edges among the points of outline and design edges, over all views.
         is_curved: whether enough of the surface is curved for the shading modality.
         corner_normals: (F,3,3) smooth normals of the surface.
     """
@@ -65,8 +66,10 @@ class PartView:
             edge_starts=np.array(raw["edge_start"]),
             edge_points=(raw["edge_points"] - center).astype(np.float32),
             edge_tangents=raw["edge_tangents"] * UNIT_16,
-            edge_kinds=np.array(raw["edge_kinds"]),
+            edge_kinds=_without_rough(np.asarray(raw["edge_kinds"])),
         )
+        drawn = self.arrays.edge_kinds & (EDGE_CONTOUR | EDGE_SHARP)
+        self.design_share = np.count_nonzero(drawn & EDGE_SHARP) / max(np.count_nonzero(drawn), 1)
         self.surface = views.surface
         self.is_curved = curved_share(self.surface) >= MIN_CURVED_SHARE
         self.corner_normals = corner_normals(self.surface)
@@ -74,9 +77,14 @@ class PartView:
     @cached_property
     def resolvable(self) -> ViewArrays:
         """``arrays`` in which unresolvable design edges are not marked as design edges."""
-        kinds = self.arrays.edge_kinds.copy()
+        kinds = np.array(self.views.arrays["edge_kinds"])
         kinds[find_unresolvable(self.views)] &= np.uint8(255 - EDGE_SHARP)
         return self.arrays._replace(edge_kinds=kinds)
+
+
+def _without_rough(kinds: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """EDGE_* bits (E,) in which creases of a rough surface are not marked as design edges."""
+    return np.where(kinds & EDGE_ROUGH, kinds & np.uint8(255 - EDGE_SHARP), kinds).astype(np.uint8)
 
 
 def find_unresolvable(views: GuideViewSet) -> NDArray[np.bool_]:

@@ -7,6 +7,7 @@ from arview.core.doors import lazy_door
 if TYPE_CHECKING:
     from arview.rendering.mesh_edges import EDGE_CONTOUR as EDGE_CONTOUR
     from arview.rendering.mesh_edges import EDGE_CREASE as EDGE_CREASE
+    from arview.rendering.mesh_edges import EDGE_ROUGH as EDGE_ROUGH
     from arview.rendering.mesh_edges import EDGE_SHARP as EDGE_SHARP
     from arview.rendering.mesh_edges import EDGE_SILHOUETTE as EDGE_SILHOUETTE
     from arview.rendering.mesh_edges import EdgeSamples as EdgeSamples
@@ -30,6 +31,7 @@ __getattr__, __dir__, __all__ = lazy_door(
         "mesh_edges": (
             "EDGE_CONTOUR",
             "EDGE_CREASE",
+            "EDGE_ROUGH",
             "EDGE_SHARP",
             "EDGE_SILHOUETTE",
             "EdgeSamples",

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.cad import Model, edge_faces
+from arview.cad import EdgeFaces, Model, edge_faces
 from arview.core.kernel import kernel
 from arview.geometry import Array
 
@@ -24,8 +24,12 @@ EDGE_SILHOUETTE = 4
 """Kind bit: one face is turned away from the camera, or the edge is open."""
 EDGE_SHARP = 8
 """Kind bit: a crease too sharp to be between two facets of a curved surface: an edge of the design."""
+EDGE_ROUGH = 16
+"""Kind bit: a sharp crease amid others, as in scans and sculpted surfaces: no edge of the design."""
 SHARP_ANGLE_DEG = 50.0
 """Dihedral angle above which a crease is sharp."""
+ROUGH_SHARE = 0.15
+"""A crease is rough if a surface beside it turns by more than this share of its angle at the flattest edge there."""
 INITIAL_SAMPLES = 4096
 """Samples for which memory is reserved at first; it doubles when it is full."""
 
@@ -39,6 +43,7 @@ class MeshEdges(NamedTuple):
         faces: (E,2) adjacent faces, the second -1 for an open edge.
         is_crease: (E,) dihedral angle above the threshold, or open, or shared by more than two faces.
         is_sharp: (E,) dihedral angle above SHARP_ANGLE_DEG, or open.
+        is_rough: (E,) see EDGE_ROUGH.
         face_normals: (F,3) unit normals.
         component: (E,) component index.
     """
@@ -48,6 +53,7 @@ class MeshEdges(NamedTuple):
     faces: NDArray[np.int32]
     is_crease: NDArray[np.bool_]
     is_sharp: NDArray[np.bool_]
+    is_rough: NDArray[np.bool_]
     face_normals: Array
     component: NDArray[np.int32]
 
@@ -85,9 +91,20 @@ def mesh_edges(model: Model, crease_angle_deg: float = 30.0) -> MeshEdges:
         faces=np.ascontiguousarray(edges.faces, dtype=np.int32),
         is_crease=is_border | (cosine < np.cos(np.deg2rad(crease_angle_deg))),
         is_sharp=is_border | (cosine < np.cos(np.deg2rad(SHARP_ANGLE_DEG))),
+        is_rough=~is_border & _are_rough(edges, np.arccos(np.clip(cosine, -1.0, 1.0)), len(faces)),
         face_normals=np.ascontiguousarray(normals),
         component=component_of_face[edges.faces[:, 0]].astype(np.int32),
     )
+
+
+def _are_rough(edges: EdgeFaces, angles_rad: Array, face_count: int) -> NDArray[np.bool_]:
+    """Whether a face at an edge (E,) with a dihedral angle turns much at both of its other edges, too."""
+    angles = np.zeros(3 * face_count)
+    for sides in edges.sides.T:
+        angles[sides[sides >= 0]] = angles_rad[sides >= 0]
+    of_face = angles.reshape(-1, 3)
+    beside = np.minimum(np.roll(of_face, 1, axis=1), np.roll(of_face, 2, axis=1)).ravel()
+    return np.asarray(np.max(beside[edges.sides], axis=1) > ROUGH_SHARE * angles_rad)
 
 
 @kernel
@@ -313,6 +330,9 @@ def sample_visible_edges(
         shown.pixels,
         shown.tangents_in_model,
         lengths_px=np.hypot(shown.along_px[:, 0], shown.along_px[:, 1]),
-        kinds=shown.kinds | np.uint8(EDGE_CONTOUR) * is_contour[is_visible] | np.uint8(EDGE_SHARP) * is_sharp,
+        kinds=shown.kinds
+        | np.uint8(EDGE_CONTOUR) * is_contour[is_visible]
+        | np.uint8(EDGE_SHARP) * is_sharp
+        | np.uint8(EDGE_ROUGH) * (is_sharp & edges.is_rough[shown.edges]),
         component=edges.component[shown.edges],
     )

@@ -143,7 +143,7 @@ class Tracker:
         self.camera = camera
         self.refiner = PoseRefiner(part or PartView(views), camera, self.options)
         # Only edges gain from an enlarged picture.
-        self._scale = SCALE if self.options.use_edge else replace(SCALE, max_enlargement=1.0)
+        self._scale = SCALE if self.refiner.options.use_edge else replace(SCALE, max_enlargement=1.0)
         self._recheck = recheck
         self._search = WideSearch(self.refiner.part.arrays, camera, self.diameter_mm)
         self._state: TrackerState | None = None
