@@ -125,7 +125,7 @@ class PoseRefiner:
         self.diameter_mm = part.views.diameter_mm
         self.intrinsics = intrinsics_of(camera)
         self._step_mm = STEP_SHARE * self.diameter_mm
-        kinds = part.arrays.edge_kinds
+        kinds = np.asarray(part.views.arrays["edge_kinds"])
         outline = int(np.count_nonzero(kinds & EDGE_CONTOUR))
         inner = int(np.count_nonzero(((kinds & EDGE_CONTOUR) == 0) & ((kinds & EDGE_SHARP) > 0)))
         inner_share = inner / max(outline + inner, 1)
