@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from arview.cad.part_file import part_from_text as part_from_text
     from arview.cad.picking import PickedFeature as PickedFeature
     from arview.cad.picking import pick_features as pick_features
+    from arview.cad.revolution import find_round_axis as find_round_axis
     from arview.cad.samples import Samples as Samples
     from arview.cad.samples import sample_surface as sample_surface
     from arview.cad.symmetry import FoundSymmetry as FoundSymmetry
@@ -57,6 +58,7 @@ __getattr__, __dir__, __all__ = lazy_door(
             "load_cad",
             "load_model",
         ),
+        "revolution": ("find_round_axis",),
         "mesh_topology": ("EdgeFaces", "edge_faces"),
         "model": (
             "Component",

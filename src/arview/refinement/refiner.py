@@ -45,8 +45,6 @@ ROTATION_SIGMA_RAD = 0.3
 """Expected rotation error of a start, which sets the damping."""
 TRANSLATION_SIGMA = 0.3
 """Expected translation error of a start, in diameters, which sets the damping."""
-MIN_DESIGN_SHARE = 0.3
-"""Share of design edges among the edges of a part below which its edges do not count while its colours are known."""
 MIN_INNER_SHARE = 0.3
 """Share of design edges inside the outline below which colours get more weight."""
 PLAIN_REGION_GAIN = 6.0
@@ -117,11 +115,7 @@ class PoseRefiner:
     def __init__(self, part: PartView, camera: Camera, options: RefinerOptions | None = None) -> None:
         self.part = part
         self.camera = camera
-        o = options or RefinerOptions()
-        # The outline of a smooth surface is no step in the picture but a limb, beside which light and gloss make
-        # others: colours alone find it better.
-        has_edges = o.use_edge and (part.design_share >= MIN_DESIGN_SHARE or not o.use_region)
-        self.options = replace(o, use_edge=has_edges)
+        o = self.options = options or RefinerOptions()
         self.diameter_mm = part.views.diameter_mm
         self.intrinsics = intrinsics_of(camera)
         self._step_mm = STEP_SHARE * self.diameter_mm
@@ -134,18 +128,24 @@ class PoseRefiner:
         region_weight = REGION_WEIGHT * (1.0 + PLAIN_REGION_GAIN * plainness)
         self._weights = ModalityWeights(
             region=region_weight if o.use_region else 0.0,
-            edge=EDGE_WEIGHT if has_edges else 0.0,
+            edge=EDGE_WEIGHT if o.use_edge else 0.0,
             edge_sigma_px=EDGE_SIGMA_PX,
             edge_threshold=EDGE_THRESHOLD,
             texture_sigma_px=TEXTURE_SIGMA_PX,
         )
-        self._weights_without_color = self._weights._replace(region=0.0, edge=EDGE_WEIGHT if o.use_edge else 0.0)
+        self._weights_without_color = self._weights._replace(region=0.0)
         self._damping = np.concatenate(
             [
                 np.full(3, 1.0 / ROTATION_SIGMA_RAD**2),
                 np.full(3, 1.0 / (TRANSLATION_SIGMA * self.diameter_mm) ** 2),
             ]
         )
+
+    def by_colors(self) -> PoseRefiner:
+        """The same refiner without edges, as long as colours are known."""
+        other = copy.copy(self)
+        other.options, other._weights = replace(self.options, use_edge=False), self._weights._replace(edge=0.0)
+        return other
 
     def with_camera(self, camera: Camera) -> PoseRefiner:
         """The same refiner for pictures of another camera, such as crops."""

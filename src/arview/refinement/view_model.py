@@ -32,6 +32,8 @@ END_ON = 0.02
 """Edges whose projected tangent is shorter than this are seen end-on and left out."""
 MIN_CURVED_SHARE = 0.2
 """Share of curved surface that shading needs, because any light can explain the brightness of flat faces."""
+MIN_DESIGN_SHARE = 0.3
+"""Share of design edges among the edges of outline and design below which a part is smooth."""
 UNIT_16 = np.float32(1.0 / 32767.0)
 """Scale of the unit vectors that guide views store as 16-bit integers."""
 
@@ -46,7 +48,7 @@ class PartView:
         arrays: the guide views, see `ViewArrays`.
         model_from_body, body_from_model: (4,4) translations between the frames of model and body.
         surface: reduced mesh of the part.
-        design_share: share of design edges among the points of outline and design edges, over all views.
+        is_smooth: whether the part has few design edges, so that its outline is mostly the limb of a curved surface.
         is_curved: whether enough of the surface is curved for the shading modality.
         corner_normals: (F,3,3) smooth normals of the surface.
     """
@@ -69,7 +71,7 @@ class PartView:
             edge_kinds=_without_rough(np.asarray(raw["edge_kinds"])),
         )
         drawn = self.arrays.edge_kinds & (EDGE_CONTOUR | EDGE_SHARP)
-        self.design_share = np.count_nonzero(drawn & EDGE_SHARP) / max(np.count_nonzero(drawn), 1)
+        self.is_smooth = np.count_nonzero(drawn & EDGE_SHARP) < MIN_DESIGN_SHARE * np.count_nonzero(drawn)
         self.surface = views.surface
         self.is_curved = curved_share(self.surface) >= MIN_CURVED_SHARE
         self.corner_normals = corner_normals(self.surface)

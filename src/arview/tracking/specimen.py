@@ -8,6 +8,7 @@ transitions between the states are a table, see `session_state`.
 
 from __future__ import annotations
 
+import copy
 import time
 
 import numpy as np
@@ -25,7 +26,7 @@ from arview.geometry import Array, invert
 from arview.guideviews import GuideViewSet
 from arview.pose import Identity, Pose, TrackingState
 from arview.tracking.diagnosis import diagnose_loss
-from arview.tracking.disambiguation import HypothesisSet
+from arview.tracking.disambiguation import HypothesisSet, RoundTurns
 from arview.tracking.estimate import Estimate
 from arview.tracking.identity import IdentityMonitor
 from arview.tracking.part_search import ALIGN, FoundPose, PartSearch
@@ -119,6 +120,7 @@ class SpecimenTracking:
             views, camera, model, like=None if like is None else like.components
         )
         self.identity = IdentityMonitor(views, camera, self.search.near, self.search.anywhere, serials)
+        self._turns: RoundTurns = RoundTurns(model, self._part, camera) if like is None else copy.copy(like._turns)
         self._state = SessionState()
 
     def __repr__(self) -> str:
@@ -216,7 +218,11 @@ class SpecimenTracking:
             reason=reason,
             mismatches=self.components.mismatches,
             unverified=self.components.unverified,
-            alternatives=(*self._state.hypotheses.poses(pose), *self.components.other_poses(pose)),
+            alternatives=(
+                *self._state.hypotheses.poses(pose),
+                *(pose @ turn for turn in self._turns.fitting),
+                *self.components.other_poses(pose),
+            ),
             identity=known.identity,
             identity_reason=known.reason,
             serial=known.serial,
@@ -285,6 +291,7 @@ class SpecimenTracking:
         if found.guide_cam_from_model is not None:
             s.reason = ALIGN
         s.hypotheses = _alternatives_of(found)
+        self._turns.reset()
         s.begin(estimate.quality >= found.lock_quality)
         return estimate
 
@@ -316,13 +323,20 @@ class SpecimenTracking:
             estimate = self._recheck_whole(image, estimate)
         if (turn := self.components.better_turn) is not None:
             return self._restart(image, estimate.cam_from_model @ turn.model_from_model, turn), reason
+        pose = estimate.cam_from_model
+        colors, covariance = self.tracker.state.appearance.colors, self.tracker.covariance(estimate)
+        if (better := self._turns.better(image, pose, covariance, colors)) is not None:
+            return self._restart(image, pose @ better), reason
+        if self._turns.fitting and not s.hypotheses and not reason:
+            s.apply(Event.CONTRADICTED)
+            return estimate, "ambiguous: it looks the same when it is turned; show another side"
         if not s.hypotheses:
             return estimate, reason
-        others = s.hypotheses.poses(estimate.cam_from_model)
-        score, *other_scores = self.tracker.scores_near(image, [estimate.cam_from_model, *others])
+        others = s.hypotheses.poses(pose)
+        score, *other_scores = [score for _, score in self.tracker.refined_near(image, [pose, *others])]
         if (better := s.hypotheses.update(score, other_scores)) is not None:
             s.hypotheses = HypothesisSet([])
-            return self._restart(image, estimate.cam_from_model @ better), reason
+            return self._restart(image, pose @ better), reason
         if not s.hypotheses or reason:
             return estimate, reason
         s.apply(Event.CONTRADICTED)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import replace
 from types import NoneType
 from typing import Protocol
 
@@ -40,7 +39,7 @@ from arview.refinement import (
 from arview.tracking.estimate import Estimate
 from arview.tracking.motion import innovation, normalised_covariance, squared_motion_distance
 from arview.tracking.search.wide_search import WideSearch
-from arview.tracking.tracker_options import SCALE, STAGES, TrackerOptions
+from arview.tracking.tracker_options import COLOR_SCALE, SCALE, STAGES, TrackerOptions
 from arview.tracking.tracker_state import FrameContext, Proposal, RefinedPose, TrackerState
 
 USE_SHADING = True
@@ -56,6 +55,11 @@ LEARNING_RATE = 0.2
 """Share by which the colour histograms follow each frame."""
 MIN_LEARNING_QUALITY = 0.4
 """Quality below which colours are not learned, and the part is searched for around the predicted pose."""
+MIN_EDGE_SUPPORT, NEW_EDGE_SUPPORT = 0.65, 0.7
+"""Mean support of the outline of a smooth part by edges below which they are left out, and from which they count
+again."""
+SUPPORT_RATE = 0.2
+"""Share by which that mean moves towards the support in a frame."""
 SCORE_RATE = 0.1
 """Share by which the usual score follows each frame."""
 OTHER_SCHEDULES_SHARE = 0.97
@@ -141,9 +145,9 @@ class Tracker:
         check_type(model, (Model, NoneType), "Tracker: model")
         self.options = options or TrackerOptions()
         self.camera = camera
-        self.refiner = PoseRefiner(part or PartView(views), camera, self.options)
+        part = part or PartView(views)
+        self.refiner = PoseRefiner(part, camera, self.options)
         # Only edges gain from an enlarged picture.
-        self._scale = SCALE if self.refiner.options.use_edge else replace(SCALE, max_enlargement=1.0)
         self._recheck = recheck
         self._search = WideSearch(self.refiner.part.arrays, camera, self.diameter_mm)
         self._state: TrackerState | None = None
@@ -177,6 +181,7 @@ class Tracker:
         state = self._state = TrackerState(cam_from_model @ self.refiner.part.model_from_body)
         if self._texture is not None:
             self._texture.clear()
+        state.uses_edges = self.options.use_edge and not self.refiner.part.is_smooth
         levels = self._levels(image, [state.cam_from_body])
         self._measure_spread(levels, 1.0)
         levels = self._levels(image, [state.cam_from_body])
@@ -185,7 +190,9 @@ class Tracker:
             # Nothing else can support the pose before there is a keyframe.
             gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
             self._texture.add_keyframe(self._texture.pyramid(gray), state.cam_from_body)
-        state.usual_score = levels.working.evidence(state.cam_from_body, state.appearance).score
+        evidence = levels.working.evidence(state.cam_from_body, state.appearance)
+        state.usual_score, state.edge_support = evidence.score, evidence.contour_support
+        self._choose_modalities()
 
     def track(self, image: NDArray[np.uint8]) -> Estimate:
         """Track the part into the next frame (H,W,3) uint8 RGB.
@@ -217,12 +224,11 @@ class Tracker:
         """The pose predicted from the motion so far, refined by near edges and the texture found."""
         # Wide schedules may lock on to a stronger edge nearby, so they are left for where the near one fails. So is a
         # start from texture alone, which carries the error of the pose at which the texture was learned.
-        o = self.options
-        yield Proposal(frame.predicted, LAST_STAGES if o.use_edge else STAGES, frame.matches, first_level=-1)
+        uses_edges = self.state.uses_edges
+        yield Proposal(frame.predicted, LAST_STAGES if uses_edges else STAGES, frame.matches, first_level=-1)
 
     def _other_schedules(self, frame: FrameContext) -> Iterator[Proposal]:
         """Other schedules, where the scores are lower than usual."""
-        o = self.options
         # What is usual is not yet known in the first frame, whose start may be off.
         if self.state.is_started and self._is_usual(frame):
             return
@@ -235,7 +241,7 @@ class Tracker:
             yield Proposal(frame.start, STAGES, frame.matches, first_level=level)
             if self.state.is_started and self._is_usual(frame):
                 return
-        if o.use_edge and first.evidence.inner_share > NEAR_SCHEDULES_MIN_INNER_SHARE:
+        if self.state.uses_edges and first.evidence.inner_share > NEAR_SCHEDULES_MIN_INNER_SHARE:
             yield Proposal(frame.start, NEAR_STAGES, frame.matches)
             yield Proposal(first.cam_from_body, NEAR_STAGES, frame.matches)
         for stages in FAR_STAGES:
@@ -366,12 +372,24 @@ class Tracker:
             # The start may have been off, so neither its scores nor the motion from it mean anything.
             state.is_started, state.usual_score, state.usual_fine_score = True, evidence.score, fine_score
         state.cam_from_body = pose
+        state.edge_support += SUPPORT_RATE * (evidence.contour_support - state.edge_support)
+        self._choose_modalities()
         self._measure_spread(frame.levels, SPREAD_RATE)
         if quality > MIN_LEARNING_QUALITY:
             if o.use_region:
                 frame.levels.finest_colors.learn_colors(pose, state.appearance, LEARNING_RATE)
             if self._texture is not None:
                 self._remember_texture(frame)
+
+    def _choose_modalities(self) -> None:
+        """Edges of a smooth part count in the next frame only where they have agreed with its outline in the last ones.
+
+        The outline of a smooth surface is no edge of the part but its limb, beside which light, gloss and shadows make
+        stronger steps; colours alone then find it better.
+        """
+        state = self.state
+        if self.refiner.part.is_smooth and self.options.use_edge and self.options.use_region:
+            state.uses_edges = state.edge_support >= (MIN_EDGE_SUPPORT if state.uses_edges else NEW_EDGE_SUPPORT)
 
     def _follow_exposure(self, channel: NDArray[np.uint8]) -> None:
         """Compensate the colours for a change of exposure since the last frame.
@@ -390,7 +408,9 @@ class Tracker:
 
     def _levels(self, image: NDArray[np.uint8], poses: list[Array]) -> RefinementPyramid:
         """The frame at the scales of the last of some poses (4,4), around the part at all of them."""
-        return RefinementPyramid(self.refiner, image, poses, self.state.spread_px, self._scale)
+        if self.state.uses_edges:
+            return RefinementPyramid(self.refiner, image, poses, self.state.spread_px, SCALE)
+        return RefinementPyramid(self.refiner.by_colors(), image, poses, self.state.spread_px, COLOR_SCALE)
 
     def _measure_spread(self, levels: RefinementPyramid, rate: float) -> None:
         """Move the estimated blur of the part's edges by a share towards that of a frame at the last pose."""
@@ -420,13 +440,13 @@ class Tracker:
 
     # --- Other poses of the last frame, and covariance ----------------------------------------------------
 
-    def scores_near(self, image: NDArray[np.uint8], cams_from_model: list[Array]) -> list[float]:
-        """Scores, see `PoseScores.mean`, of poses (4,4) in the last frame, each after a fine refinement."""
+    def refined_near(self, image: NDArray[np.uint8], cams_from_model: list[Array]) -> list[tuple[Array, float]]:
+        """Poses (4,4) after a fine refinement in the last frame, each with its score, see `PoseScores.mean`."""
         appearance, fine = self.state.appearance, STAGES[-2:]
         in_body = [pose @ self.refiner.part.model_from_body for pose in cams_from_model]
         levels = self._levels(image, in_body)
         poses = [levels.refine(pose, fine, appearance, first=-1)[0] for pose in in_body]
-        return [levels.scores(pose, appearance).mean for pose in poses]
+        return [(pose @ self.refiner.part.body_from_model, levels.scores(pose, appearance).mean) for pose in poses]
 
     def covariance(self, estimate: Estimate) -> Array:
         """Covariance (6,6) of the twist (rad, mm) about the model's centre.

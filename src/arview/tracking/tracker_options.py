@@ -9,7 +9,7 @@ from arview.refinement import TRACK_STAGES, RefinerOptions, ShadingOptions, Stag
 
 STAGES: tuple[Stage, ...] = TRACK_STAGES
 """Schedule of a usual frame."""
-SCALE = WorkingScaleOptions()
+SCALE, COLOR_SCALE = WorkingScaleOptions(), WorkingScaleOptions(max_enlargement=1.0)
 """Options of the pictures in which poses are refined and judged."""
 
 

@@ -24,6 +24,8 @@ class TrackerState:
         appearance: colours of part and background.
         exposure: brightness relative to the frame in which colours were first learned.
         sparse_gray: (rows,columns) brightness of the last frame on a coarse grid.
+        edge_support: running mean of the support of the outline by edges.
+        uses_edges: whether edges are used in the next frame, see `Tracker`.
         best_contour_support: best recent support of the outline.
         is_started: whether a frame has been tracked since the start.
         spread_px: standard deviation of the blur of the part's edges, px of the frame; 0 where it is not known.
@@ -37,6 +39,8 @@ class TrackerState:
     appearance: Appearance = field(default_factory=Appearance)
     exposure: float = 1.0
     sparse_gray: NDArray[np.float64] | None = None
+    edge_support: float = 0.0
+    uses_edges: bool = True
     best_contour_support: float = 0.0
     is_started: bool = False
     spread_px: float = 0.0

@@ -80,6 +80,17 @@ def jug() -> Model:
     return _model("jug", smooth_difference(solid, hollow, 5.0), (-90, 175), (0.22, 0.36, 0.52))
 
 
+def mug() -> Model:
+    """A mug, 95 mm high: a plain body of revolution, open at the top, whose handle hides behind it from many sides."""
+    outside = capsule((0, 0, 22), (0, 0, 130), 40, 40)
+    above = capsule((0, 0, 595), (0, 0, 596), 500, 500)
+    handle = rod([(-36, 0, 78), (-58, 0, 74), (-66, 0, 52), (-56, 0, 30), (-36, 0, 26)], 6.0)
+    solid = smooth_union([smooth_difference(outside, above, 3.0), handle], 4.0)
+    return _model(
+        "mug", smooth_difference(solid, capsule((0, 0, 42), (0, 0, 200), 35, 35), 3.0), (-75, 130), (0.62, 0.58, 0.50)
+    )
+
+
 def manifold() -> Model:
     """A cast pipe manifold, 190 mm long: a bent main pipe with three branches and thick rounded collars."""
     angle = np.linspace(0.0, 0.62 * np.pi, 7)
@@ -282,7 +293,7 @@ def _is_closed(faces: NDArray[np.int64]) -> bool:
     return len(there) == len(sides) and np.array_equal(there, back)
 
 
-_MAKERS: dict[str, Callable[[], Model]] = {"duck": duck, "cat": cat, "jug": jug, "manifold": manifold}
+_MAKERS: dict[str, Callable[[], Model]] = {"duck": duck, "cat": cat, "jug": jug, "mug": mug, "manifold": manifold}
 CURVED_SHAPES = tuple(_MAKERS)
 """Names of the curved shapes."""
 
