@@ -13,10 +13,10 @@ from click.testing import CliRunner
 
 from arview.cad.assembly_tree import MAX_LINES, tree_lines
 from arview.cad.check import GATHERED_ROWS, check_part
-from arview.cad.equal_shapes import ShapeSymmetries
 from arview.cad.model import Component, make_model
 from arview.cad.part import ComponentSettings, Part
 from arview.cad.part_file import load_part
+from arview.cad.shape.equal_shapes import ShapeSymmetries
 from arview.cad.tolerance_check import EXPECTED_U_PX, tolerance_remarks
 from arview.cli import main
 from helpers.cad_files import box, glb_with_boxes
@@ -104,7 +104,7 @@ def test_symmetries_of_equal_shapes_are_moved_along() -> None:
 def test_the_search_for_symmetries_is_limited_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     one, other = assembly(2).model.components
     wide = replace(other, name="wide", vertices_in_model=other.vertices_in_model * [2.0, 1.0, 1.0])
-    monkeypatch.setattr("arview.cad.equal_shapes.MAX_SHAPES", 1)
+    monkeypatch.setattr("arview.cad.shape.equal_shapes.MAX_SHAPES", 1)
     shapes = ShapeSymmetries()
     assert shapes.of(one)
     assert shapes.of(other)

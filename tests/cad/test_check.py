@@ -12,7 +12,7 @@ from arview.cad import PartFinding, ViewRange, check_part, load_part, make_model
 from arview.cad.check import can_confuse
 from arview.cad.model import Component
 from arview.cad.part import ComponentSettings, Datum, Part
-from arview.cad.symmetry import Symmetry, find_symmetries
+from arview.cad.shape.symmetry import Symmetry, find_symmetries
 from arview.camera import Camera
 from arview.geometry import apply, exp_so3, rigid
 from helpers.cad_files import box

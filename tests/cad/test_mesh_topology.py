@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from arview.cad.mesh_topology import edge_faces
+from arview.cad.shape.mesh_topology import edge_faces
 
 
 def test_a_tetrahedron_has_two_faces_at_each_edge() -> None:

@@ -11,7 +11,7 @@ import pytest
 from arview.cad.model import Component, Model, make_model
 from arview.cad.part import ComponentSettings, NamedPoint, Part, Vector
 from arview.cad.part_file import load_part
-from arview.cad.symmetry import Symmetry
+from arview.cad.shape.symmetry import Symmetry
 from arview.errors import InputError
 from arview.geometry import Array, apply, exp_so3, rigid
 from arview.measurement.measurand import measurand_of

@@ -14,8 +14,6 @@ if TYPE_CHECKING:
     from arview.cad.load import LoadedCad as LoadedCad
     from arview.cad.load import load_cad as load_cad
     from arview.cad.load import load_model as load_model
-    from arview.cad.mesh_topology import EdgeFaces as EdgeFaces
-    from arview.cad.mesh_topology import edge_faces as edge_faces
     from arview.cad.model import Component as Component
     from arview.cad.model import Model as Model
     from arview.cad.model import make_model as make_model
@@ -32,12 +30,14 @@ if TYPE_CHECKING:
     from arview.cad.part_file import part_from_text as part_from_text
     from arview.cad.picking import PickedFeature as PickedFeature
     from arview.cad.picking import pick_features as pick_features
-    from arview.cad.revolution import find_round_axis as find_round_axis
     from arview.cad.samples import Samples as Samples
     from arview.cad.samples import sample_surface as sample_surface
-    from arview.cad.symmetry import FoundSymmetry as FoundSymmetry
-    from arview.cad.symmetry import Symmetry as Symmetry
-    from arview.cad.symmetry import find_symmetries as find_symmetries
+    from arview.cad.shape.mesh_topology import EdgeFaces as EdgeFaces
+    from arview.cad.shape.mesh_topology import edge_faces as edge_faces
+    from arview.cad.shape.revolution import find_round_axis as find_round_axis
+    from arview.cad.shape.symmetry import FoundSymmetry as FoundSymmetry
+    from arview.cad.shape.symmetry import Symmetry as Symmetry
+    from arview.cad.shape.symmetry import find_symmetries as find_symmetries
     from arview.cad.view_range import ViewRange as ViewRange
     from arview.cad.viewpoint import Viewpoint as Viewpoint
     from arview.cad.viewpoint import pose_at as pose_at
@@ -58,8 +58,8 @@ __getattr__, __dir__, __all__ = lazy_door(
             "load_cad",
             "load_model",
         ),
-        "revolution": ("find_round_axis",),
-        "mesh_topology": ("EdgeFaces", "edge_faces"),
+        "shape.revolution": ("find_round_axis",),
+        "shape.mesh_topology": ("EdgeFaces", "edge_faces"),
         "model": (
             "Component",
             "Model",
@@ -88,7 +88,7 @@ __getattr__, __dir__, __all__ = lazy_door(
             "Samples",
             "sample_surface",
         ),
-        "symmetry": (
+        "shape.symmetry": (
             "FoundSymmetry",
             "Symmetry",
             "find_symmetries",

@@ -12,11 +12,11 @@ import numpy as np
 from arview.cad.assembly_tree import tree_lines
 from arview.cad.component_remarks import Remark, Severity, gathered, listed, mesh_remarks, size_remarks
 from arview.cad.datum_check import datum_problems
-from arview.cad.equal_shapes import ShapeSymmetries
 from arview.cad.fitness import MeshFitness, inspect_mesh
 from arview.cad.model import Component
 from arview.cad.part import ComponentSettings, Part
-from arview.cad.symmetry import FoundSymmetry, Symmetry, find_symmetries
+from arview.cad.shape.equal_shapes import ShapeSymmetries
+from arview.cad.shape.symmetry import FoundSymmetry, Symmetry, find_symmetries
 from arview.cad.tolerance_check import tolerance_remarks, untold_tolerances
 from arview.cad.view_range import ViewRange
 from arview.camera import Camera

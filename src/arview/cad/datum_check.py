@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arview.cad.fitness import face_areas
-from arview.cad.mesh_topology import edge_faces
 from arview.cad.model import Component
 from arview.cad.part import Datum, Part
+from arview.cad.shape.mesh_topology import edge_faces
 from arview.core.fits import fit_circle
 from arview.geometry import Array
 

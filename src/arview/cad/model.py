@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.cad.centroid import center_of_mass
+from arview.cad.shape.centroid import center_of_mass
 from arview.errors import InputError
 from arview.geometry import Array
 

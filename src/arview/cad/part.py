@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Literal
 
 from arview.cad.model import Model
-from arview.cad.symmetry import Symmetry
+from arview.cad.shape.symmetry import Symmetry
 from arview.cad.view_range import Up, ViewRange
 from arview.errors import InputError
 

@@ -27,7 +27,7 @@ from arview.cad.part import (
     unknown_component,
 )
 from arview.cad.rework_table import read_rework, read_rework_kinds
-from arview.cad.symmetry import Symmetry
+from arview.cad.shape.symmetry import Symmetry
 from arview.cad.toml_table import TomlTable
 from arview.cad.view_range import UP_AXES, Up, ViewRange
 from arview.core.checks import PATH, check_type

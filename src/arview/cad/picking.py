@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from arview.cad.datum_check import RoundEdge, find_rims
 from arview.cad.fitness import face_areas
-from arview.cad.mesh_topology import edge_faces
 from arview.cad.model import Component
 from arview.cad.part import DatumFeature
+from arview.cad.shape.mesh_topology import edge_faces
 from arview.core.fits import fit_circle
 from arview.errors import InputError
 from arview.geometry import Array

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arview.cad import Part, load_part
-from arview.cad.symmetry import Symmetry
+from arview.cad.shape.symmetry import Symmetry
 from arview.camera import Camera
 from arview.errors import InputError
 from arview.geometry import Array, check_rigid, rigid

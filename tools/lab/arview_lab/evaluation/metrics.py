@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 
 from arview.cad.model import Model
-from arview.cad.symmetry import Symmetry
+from arview.cad.shape.symmetry import Symmetry
 from arview.camera import Camera
 from arview.geometry import Array, apply, exp_so3, rigid, rotation_angle_rad, skew
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from arview.cad.model import Model
-from arview.cad.symmetry import Symmetry
+from arview.cad.shape.symmetry import Symmetry
 from arview.cad.view_range import ViewRange
 from arview.detection import Detector
 from arview.detection.search.local_search import LocalSearch

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arview.cad.model import Model
-from arview.cad.symmetry import Symmetry
+from arview.cad.shape.symmetry import Symmetry
 from arview.camera import Camera
 from arview.geometry import Array
 from arview.guideviews.surface import Surface, differing, draw_surface

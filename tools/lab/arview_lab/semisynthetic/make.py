@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from arview.cad.model import Model
-from arview.cad.symmetry import Symmetry
+from arview.cad.shape.symmetry import Symmetry
 from arview.camera import Camera
 from arview.core.progress import StepProgress
 from arview.errors import InputError

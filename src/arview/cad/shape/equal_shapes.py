@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from arview.cad.model import Component
-from arview.cad.symmetry import FoundSymmetry, find_symmetries
+from arview.cad.shape.symmetry import FoundSymmetry, find_symmetries
 from arview.geometry import Array
 
 _SAME_SHARE = 1e-4

@@ -1,0 +1,1 @@
+"""The shape of surfaces: edges, symmetries, axes of revolution, centroids."""
