@@ -22,7 +22,7 @@ from helpers.live_client import running
 from helpers.live_sample import options
 from helpers.page import WATCH, opened
 
-WIDTH_PX = 800
+WIDTH_PX = 560
 BY = "M. Lang"
 SERIAL = "PL-0417"
 PHONE = {"width": 390, "height": 844}
