@@ -111,7 +111,6 @@ def _shaded(
 ) -> Array:  # fmt: skip
     """Grey values of a picture: solid noise of octaves from 16 mm down to 1 mm, times the brightness of the face."""
     fx, fy, cx, cy = intrinsics
-    n = grid.shape[0]
     grey = np.full(face.shape, 30.0)
     for row in range(face.shape[0]):
         for column in range(face.shape[1]):
