@@ -1,7 +1,7 @@
 """The whole inspection on the page: photos, verdict, rework, check again, decisions, signature, report.
 
-Small: half of the plate's photos, at half their size, and the session is told where the camera is. `make demo-live`
-does the same with all photos and the tracker.
+Small: a part with four blocks, and the session is told where the camera is. `make demo-live` does the same with the
+sample's photos and the tracker.
 """
 
 from __future__ import annotations
@@ -11,18 +11,21 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
+from arview.camera.read import save_camera
 from arview.station.live.options import JobOptions
 from arview.station.live.server.loading import load_subjects
 from arview.station.live.stream.subjects import Subjects
 from helpers import live_browser
-from helpers.inspection_loop import COMPONENT, PLATE, Inspector, WalkSession, camera_script, first_walk, second_walk
+from helpers.inspection_loop import Inspector, Stop, WalkSession, camera_script
 from helpers.live_client import running
 from helpers.live_sample import options
 from helpers.page import WATCH, opened
+from helpers.photo_scene import CAMERA
+from helpers.walk_bench import AGAIN, COMPONENT, POSES, WRONG_MM, photo, write_part
 
-WIDTH_PX = 800
 BY = "M. Lang"
 SERIAL = "PL-0417"
 PHONE = {"width": 390, "height": 844}
@@ -30,20 +33,23 @@ pytestmark = pytest.mark.slow
 
 
 def test_whole_inspection(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    first, second = first_walk(range(0, 24, 2), WIDTH_PX), second_walk((0, 1, 2, 4, 5), WIDTH_PX)
-    walk = [*first, *second]
+    first = [Stop(photo(pose, False, ".jpg"), pose) for pose in POSES]
+    second = [Stop(photo(pose, True, ".jpg"), pose) for pose in AGAIN]
+    walk, wrong_mm = [*first, *second], float(np.linalg.norm(WRONG_MM))
 
     def session(subjects: Subjects, camera: Any) -> Any:
         return WalkSession(walk, [one.name for one in subjects[0].part.model.components], camera)
 
     monkeypatch.setattr(Subjects, "session", session)
+    camera_file = tmp_path / "camera.json"
+    save_camera(CAMERA, camera_file)
     chosen = options(
-        inspection=None, clients=1, camera=str(PLATE / "camera.json"), width=640, height=480,
+        inspection=None, clients=1, camera=str(camera_file), width=640, height=480,
         jobs=JobOptions(folder=tmp_path / "jobs"),
     )  # fmt: skip
     script = WATCH + camera_script(is_numbered=True)
 
-    subjects = load_subjects([str(PLATE / "part.toml")], None, None, chosen)
+    subjects = load_subjects([str(write_part(tmp_path))], None, None, chosen)
     with (
         live_browser.browser(None) as chromium,
         running(chosen, lambda: subjects) as server,
@@ -56,13 +62,13 @@ def test_whole_inspection(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
         job = inspector.measure("last photo to the verdicts")
         found = {one["name"]: one for one in job["inspection"]["components"]}
         assert job["inspection"]["verdict"] == "fail" and found[COMPONENT]["verdict"] == "fail"
-        assert found[COMPONENT]["distance_mm"] == pytest.approx(3.0, abs=0.15)
-        assert len(found) == 16
+        assert found[COMPONENT]["distance_mm"] == pytest.approx(wrong_mm, abs=0.3)
+        assert len(found) == 4
 
         again = inspector.check_again(COMPONENT, range(len(first), len(walk)), BY)
         (row,) = [one for one in again["before_after"] if one["name"] == COMPONENT]
-        assert row["before_mm"] == pytest.approx(3.0, abs=0.15) and row["verdict_before"] == "fail"
-        assert row["after_mm"] < 0.25 and row["verdict_after"] == "pass"
+        assert row["before_mm"] == pytest.approx(wrong_mm, abs=0.3) and row["verdict_before"] == "fail"
+        assert row["after_mm"] < 0.4 and row["verdict_after"] == "pass"
         inspector.page.locator("#job .primary", has_text="Result").click()
         for name in (name for name, one in found.items() if one["verdict"] == "fail"):
             is_ok = name == COMPONENT

@@ -265,7 +265,6 @@ def large_assembly(path: Path, columns: int, rows: int) -> None:
     scene = trimesh.Scene()
     scene.add_geometry(trimesh.creation.box((30.0 * columns, 30.0 * rows, 6.0)), node_name="plate", geom_name="plate")
     pin, nut = trimesh.creation.cylinder(4.0, 30.0, sections=96), trimesh.creation.annulus(5.0, 10.0, 8.0, sections=96)
-    pin, nut = pin.subdivide().subdivide(), nut.subdivide()
     for column in range(columns):
         scene.graph.update(frame_to=f"row_{column}", matrix=np.eye(4))
         for row in range(rows):

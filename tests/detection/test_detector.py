@@ -76,7 +76,7 @@ def anywhere(rng: np.random.Generator) -> np.ndarray:
 def test_the_part_is_found_without_a_hint() -> None:
     rng = np.random.default_rng(11)
     found, exact = 0, 0
-    for k in range(20):
+    for k in range(10):
         truth = anywhere(rng)
         detections = detector().detect(picture(truth, seed=k, scene=k % 9, noise=3.0))
         qualities = [d.quality for d in detections]
@@ -89,13 +89,13 @@ def test_the_part_is_found_without_a_hint() -> None:
         mm, _, deg = error(detections[0].cam_from_model, truth)
         found += deg < 10.0 and abs(depth / depth_truth - 1.0) < 0.05
         exact += mm < 5.0 and deg < 1.0
-    assert found >= 18
-    assert exact >= 16
+    assert found >= 9
+    assert exact >= 8
 
 
 @pytest.mark.slow
 def test_nothing_is_found_where_there_is_no_part() -> None:
-    for k in range(20):
+    for k in range(10):
         assert detector().detect(picture(None, seed=k, scene=20 + k)) == []
 
 
@@ -105,7 +105,7 @@ def test_the_part_is_found_over_the_full_sphere_and_all_rolls() -> None:
     everywhere = Detector(views, CAMERA)
     rng = np.random.default_rng(3)
     found, wrong_ones = 0, 0
-    for k in range(12):
+    for k in range(7):
         truth = pose_from(
             rng.uniform(-180, 180), rng.uniform(0, 80), rng.uniform(400, 650), None, rng.uniform(-180, 180)
         )
@@ -114,7 +114,7 @@ def test_the_part_is_found_over_the_full_sphere_and_all_rolls() -> None:
             mm, _, deg = error(detections[0].cam_from_model, truth)
             found += mm < 8.0 and deg < 2.0
             wrong_ones += mm > 50.0 or deg > 5.0
-    assert found >= 10
+    assert found >= 6
     assert wrong_ones == 0
 
 
@@ -200,7 +200,7 @@ def test_a_box_is_found_from_all_directions_up_to_its_symmetries() -> None:
     assert len(sought.disambiguator.exact_rotations) == 4
     rng = np.random.default_rng(5)
     found, wrong_ones = 0, 0
-    for k in range(16):
+    for k in range(11):
         place = rng.uniform(-180, 180), rng.uniform(-80, 80), rng.uniform(280, 450)
         truth = pose_from(*place, block(), rng.uniform(-180, 180))
         detections = sought.detect(picture(truth, block(), seed=k, scene=k % 9, noise=3.0), max_results=1)
@@ -213,7 +213,7 @@ def test_a_box_is_found_from_all_directions_up_to_its_symmetries() -> None:
             mm, _, deg = min((error(one, truth, block()) for one in alike), key=lambda of: of[2])
             found += mm < 8.0 and deg < 2.0
             wrong_ones += mm > 50.0 or deg > 5.0
-    assert found >= 14
+    assert found >= 9
     # From some directions a plain box is similar to a box seen from another one.
     assert wrong_ones <= 1
 

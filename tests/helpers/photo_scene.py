@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cache
 from pathlib import Path
 
 import cv2
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
-from scipy.ndimage import map_coordinates
 
 from arview.cad.model import Component, Model, make_model
 from arview.camera import Camera
@@ -65,46 +66,90 @@ def photograph(
     inverse_depth, face = rasterise(
         apply(cam_from_model, vertices), faces, twice.fx, twice.fy, twice.cx, twice.cy, twice.width, twice.height
     )
-    columns, rows = np.meshgrid(np.arange(twice.width), np.arange(twice.height))
-    rays = np.stack([(columns - twice.cx) / twice.fx, (rows - twice.cy) / twice.fy, np.ones(columns.shape)], -1)
-    hit = face >= 0
-    points = apply(invert(cam_from_model), rays[hit] / inverse_depth[hit][:, None])
-    owner = np.repeat(np.arange(len(parts)), [len(faces) for _, faces in parts])[face[hit]]
-    texture = np.empty_like(points)
-    for i, place in enumerate(places):
-        texture[owner == i] = apply(invert(place), points[owner == i])
+    owner = np.repeat(np.arange(len(parts)), [len(faces) for _, faces in parts])
     corners = vertices[faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     light = 0.65 + 0.35 * normals @ (0.3, -0.4, 0.87)
-    grey = np.full(face.shape, 30.0)
     tones = {"bench": 0.45, "plate": 1.25}
     tone = np.concatenate([np.full(len(one.faces), tones.get(one.name, 0.8)) for one in model.components])
-    grey[hit] = _texture(texture, seed) * (light * tone)[face[hit]]
+    texture_from_cam = np.stack([invert(place) @ invert(cam_from_model) for place in places])
+    intrinsics = np.array([twice.fx, twice.fy, twice.cx, twice.cy])
+    grey = _shaded(face, inverse_depth, owner, light * tone, texture_from_cam, intrinsics, _grid(seed))
     small = cv2.resize(grey, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
     through = _through_lens(small, camera)
     through += np.random.default_rng(int(abs(cam_from_model[:3].sum()) * 1e3) + seed).normal(0.0, noise, through.shape)
     return np.repeat(np.clip(through, 0, 255).astype(np.uint8)[..., None], 3, axis=2)
 
 
-def _texture(points: Array, seed: int) -> Array:
-    """Grey values of points: noise of octaves from 16 mm down to 1 mm, filling space."""
-    grid = np.random.default_rng(seed).uniform(-1.0, 1.0, (_GRID, _GRID, _GRID))
-    value = np.full(len(points), 120.0)
-    for size_mm, weight in ((16.0, 30.0), (6.0, 30.0), (2.5, 30.0), (1.0, 20.0)):
-        value += weight * map_coordinates(grid, (points / size_mm + 0.37 * size_mm).T, order=1, mode="grid-wrap")
-    return value
+@cache
+def _grid(seed: int) -> Array:
+    return np.random.default_rng(seed).uniform(-1.0, 1.0, (_GRID, _GRID, _GRID))
+
+
+@njit(cache=True)
+def _noise(grid: Array, x: float, y: float, z: float) -> float:
+    """Value of a grid at a point, between its nodes; the grid is repeated in all directions."""
+    i, j, k = int(np.floor(x)), int(np.floor(y)), int(np.floor(z))
+    a, b, c = x - i, y - j, z - k
+    n = grid.shape[0]
+    i, j, k = i % n, j % n, k % n
+    i_next, j_next, k_next = (i + 1) % n, (j + 1) % n, (k + 1) % n
+    low = (1 - b) * ((1 - c) * grid[i, j, k] + c * grid[i, j, k_next]) + b * (
+        (1 - c) * grid[i, j_next, k] + c * grid[i, j_next, k_next]
+    )
+    high = (1 - b) * ((1 - c) * grid[i_next, j, k] + c * grid[i_next, j, k_next]) + b * (
+        (1 - c) * grid[i_next, j_next, k] + c * grid[i_next, j_next, k_next]
+    )
+    return (1 - a) * low + a * high
+
+
+@njit(cache=True)
+def _shaded(
+    face: NDArray[np.int32], inverse_depth: Array, owner: NDArray[np.int64], brightness: Array, texture_from_cam: Array,
+    intrinsics: Array, grid: Array,
+) -> Array:  # fmt: skip
+    """Grey values of a picture: solid noise of octaves from 16 mm down to 1 mm, times the brightness of the face."""
+    fx, fy, cx, cy = intrinsics
+    grey = np.full(face.shape, 30.0)
+    for row in range(face.shape[0]):
+        for column in range(face.shape[1]):
+            k = face[row, column]
+            if k < 0:
+                continue
+            depth = 1.0 / inverse_depth[row, column]
+            u, v = (column - cx) / fx * depth, (row - cy) / fy * depth
+            place = texture_from_cam[owner[k]]
+            x = place[0, 0] * u + place[0, 1] * v + place[0, 2] * depth + place[0, 3]
+            y = place[1, 0] * u + place[1, 1] * v + place[1, 2] * depth + place[1, 3]
+            z = place[2, 0] * u + place[2, 1] * v + place[2, 2] * depth + place[2, 3]
+            value = 120.0
+            for size_mm, weight in ((16.0, 30.0), (6.0, 30.0), (2.5, 30.0), (1.0, 20.0)):
+                value += weight * _noise(
+                    grid, x / size_mm + 0.37 * size_mm, y / size_mm + 0.37 * size_mm, z / size_mm + 0.37 * size_mm
+                )
+            grey[row, column] = value * brightness[k]
+    return grey
 
 
 def _through_lens(image: Array, camera: Camera) -> Array:
-    columns, rows = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+    columns, rows = _lens_map(
+        camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, tuple(camera.dist.tolist())
+    )
+    return cv2.remap(image.astype(np.float32), columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT).astype(
+        np.float64
+    )
+
+
+@cache
+def _lens_map(
+    width: int, height: int, fx: float, fy: float, cx: float, cy: float, dist: tuple[float, ...]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Column and row, in the picture without distortion, of each pixel of a picture."""
+    columns, rows = np.meshgrid(np.arange(width), np.arange(height))
+    camera = Camera(width, height, fx, fy, cx, cy, np.array(dist))
     ideal = camera.unproject(np.stack([columns, rows], -1).astype(float))
-    return cv2.remap(
-        image.astype(np.float32),
-        (ideal[..., 0] * camera.fx + camera.cx).astype(np.float32),
-        (ideal[..., 1] * camera.fy + camera.cy).astype(np.float32),
-        cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT,
-    ).astype(np.float64)  # fmt: skip
+    return (ideal[..., 0] * fx + cx).astype(np.float32), (ideal[..., 1] * fy + cy).astype(np.float32)
 
 
 def write_photos(folder: Path, pictures: list[Picture], stem: str = "img") -> list[Path]:

@@ -11,6 +11,7 @@ from functools import cache
 
 import cv2
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from arview.cad.model import Component, Model, make_model
@@ -183,6 +184,66 @@ def background(seed: int, width: int = CAMERA.width, height: int = CAMERA.height
     return np.asarray(np.clip(image, 0, 255).astype(np.uint8))
 
 
+@njit(cache=True)
+def _texture_places(
+    face: NDArray[np.int32], inverse_depth: Array, cam_from_model: Array, lens: Array, largest: NDArray[np.int64],
+    owners: NDArray[np.int32],
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:  # fmt: skip
+    """Column and row in the texture, (H,W) each, of the pixels that show a face.
+
+    Texture lies on the surface: the two axes across the normal's largest component, shifted per component.
+    """
+    x, y = np.zeros(face.shape, np.float32), np.zeros(face.shape, np.float32)
+    fx, fy, cx, cy = lens
+    for row in range(face.shape[0]):
+        for column in range(face.shape[1]):
+            k = face[row, column]
+            if k < 0:
+                continue
+            z = 1.0 / inverse_depth[row, column]
+            a, b, c = (column - cx) / fx * z, (row - cy) / fy * z, z
+            a, b, c = a - cam_from_model[0, 3], b - cam_from_model[1, 3], c - cam_from_model[2, 3]
+            first, second = (1 if largest[k] == 0 else 0), (1 if largest[k] == 2 else 2)
+            shift = 97.0 * owners[k] + 41.0 * largest[k]
+            u = cam_from_model[0, first] * a + cam_from_model[1, first] * b + cam_from_model[2, first] * c
+            v = cam_from_model[0, second] * a + cam_from_model[1, second] * b + cam_from_model[2, second] * c
+            x[row, column] = 510.0 - abs((2.0 * u + shift) % 1020.0 - 510.0)
+            y[row, column] = 510.0 - abs((2.0 * v + shift) % 1020.0 - 510.0)
+    return x, y
+
+
+@njit(cache=True)
+def _painted(face: NDArray[np.int32], colors: Array, pattern: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(H,W,3) the color of each pixel's face and the pattern on it; black beside the part."""
+    image = np.zeros((*face.shape, 3), np.float32)
+    for row in range(face.shape[0]):
+        for column in range(face.shape[1]):
+            k = face[row, column]
+            if k >= 0:
+                for channel in range(3):
+                    image[row, column, channel] = colors[k, channel] + pattern[row, column]
+    return image
+
+
+def _seen_box(face: NDArray[np.int32]) -> tuple[int, int, int, int]:
+    """left, top, right, bottom of the pixels that show a face, even numbers; two pixels where none does."""
+    rows, columns = np.flatnonzero((face >= 0).any(axis=1)), np.flatnonzero((face >= 0).any(axis=0))
+    if not len(rows):
+        return 0, 0, 2, 2
+    left, top = int(columns[0]) // 2 * 2, int(rows[0]) // 2 * 2
+    return left, top, int(columns[-1]) // 2 * 2 + 2, int(rows[-1]) // 2 * 2 + 2
+
+
+@njit(cache=True)
+def _exposed(image: NDArray[np.float32], gain: float, noise: float, deviations: Array) -> NDArray[np.uint8]:
+    """Grey levels of a picture with a gain and noise."""
+    result = np.empty(image.shape, np.uint8)
+    flat, given, normal = result.reshape(-1), image.reshape(-1), deviations.reshape(-1)
+    for i in range(len(flat)):
+        flat[i] = np.uint8(min(max(np.rint(np.float32(gain) * given[i] + noise * normal[i]), 0.0), 255.0))
+    return result
+
+
 def picture(
     cam_from_model: Array | None,
     model: Model | None = None,
@@ -211,39 +272,26 @@ def picture(
         inverse_depth, ids = rasterise(
             apply(cam_from_model, vertices), faces, big.fx, big.fy, big.cx, big.cy, big.width, big.height
         )
-        seen = ids >= 0
-        v, u = np.nonzero(seen)
-        z = 1.0 / inverse_depth[seen]
-        in_cam = np.stack([(u - big.cx) / big.fx * z, (v - big.cy) / big.fy * z, z], axis=1)
-        in_model = (in_cam - cam_from_model[:3, 3]) @ cam_from_model[:3, :3]
         corners = vertices[faces]
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-        face = ids[seen]
-        light = 0.55 + 0.45 * np.clip(normals[face] @ LIGHT_IN_MODEL, -0.6, 1.0)
-        # Texture lies on the surface: the two axes across the normal's largest component, shifted per component.
-        largest = np.argmax(np.abs(normals[face]), axis=1)
-        axes = np.array([[1, 2], [0, 2], [0, 1]])[largest]
-        place = np.take_along_axis(in_model, axes, axis=1) * 2.0 + 97.0 * owners[face, None] + 41.0 * largest[:, None]
-        x, y = (510.0 - np.abs(np.mod(place, 1020.0) - 510.0)).astype(np.float32).T
-        # remap takes at most 32767 rows.
-        pattern = np.empty(len(x), dtype=np.float32)
-        for start in range(0, len(x), 30000):
-            stop = start + 30000
-            pattern[start:stop] = cv2.remap(_texture(7), x[start:stop, None], y[start:stop, None], cv2.INTER_LINEAR)[
-                :, 0
-            ]
-        colors = np.array([c.color for c in model.components]) * 230.0
-        large = np.zeros((big.height, big.width, 3), dtype=np.float32)
-        large[seen] = colors[owners[face]] * light[:, None] + contrast * pattern[:, None]
-        size = (camera.width, camera.height)
-        covered = cv2.resize(seen.astype(np.float32), size, interpolation=cv2.INTER_AREA)[..., None]
-        image = image * (1.0 - covered) + cv2.resize(large, size, interpolation=cv2.INTER_AREA)
+        light = 0.55 + 0.45 * np.clip(normals @ LIGHT_IN_MODEL, -0.6, 1.0)
+        colors = np.array([c.color for c in model.components])[owners] * 230.0 * light[:, None]
+        lens = np.array([big.fx, big.fy, big.cx, big.cy])
+        largest = np.argmax(np.abs(normals), axis=1)
+        left, top, right, bottom = _seen_box(ids)
+        seen, depth = ids[top:bottom, left:right], inverse_depth[top:bottom, left:right]
+        lens[2:] -= left, top
+        x, y = _texture_places(seen, depth, cam_from_model, lens, largest, owners)
+        large = _painted(seen, colors, contrast * cv2.remap(_texture(7), x, y, cv2.INTER_LINEAR))
+        size = ((right - left) // 2, (bottom - top) // 2)
+        covered = cv2.resize((seen >= 0).astype(np.float32), size, interpolation=cv2.INTER_AREA)[..., None]
+        place = np.s_[top // 2 : bottom // 2, left // 2 : right // 2]
+        image[place] = image[place] * (1.0 - covered) + cv2.resize(large, size, interpolation=cv2.INTER_AREA)
     if card is not None:
         left, top, right, bottom = card
         image[top:bottom, left:right] = background(scene + 500, camera.width, camera.height)[top:bottom, left:right]
-    image = gain * image + rng.normal(0.0, noise, image.shape)
-    return np.asarray(np.clip(np.round(image), 0, 255).astype(np.uint8))
+    return _exposed(image, gain, noise, rng.standard_normal(image.shape))
 
 
 def part_box(

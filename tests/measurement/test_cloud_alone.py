@@ -15,7 +15,7 @@ from arview.cli import ExitCode, main
 from arview.errors import InputError
 from arview.geometry import Array, apply, exp_so3, invert, rigid
 from arview.inspection import Inspection, load_inspection
-from arview.measurement.cloud import global_registration
+from arview.measurement.cloud import global_registration, pair_registration
 from arview.measurement.cloud.global_registration import find_model_in_cloud
 from arview.measurement.cloud.mesh_surface import MeshSurface
 from arview.measurement.datums.in_cloud import measure_datums_in_cloud
@@ -37,6 +37,8 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """A coarser search than usual, for time."""
     for name, value in {"POINTS": 2000, "VOXELS": 28, "STEP_DEG": 8.0}.items():
         monkeypatch.setattr(global_registration, name, value)
+    for name, value in {"FIRST_PAIRS": 4000, "PAIRS": 6000, "ROUNDS": 2}.items():
+        monkeypatch.setattr(pair_registration, name, value)
 
 
 def scan(model: Model, place: Array = PLACE, count: int = 60_000, seed: int = 0, scale: float = 1.0) -> DenseCloud:

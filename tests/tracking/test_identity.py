@@ -344,7 +344,7 @@ def test_an_outline_holds_its_centre_and_not_the_pixels_beside_it() -> None:
 # --- Films -----------------------------------------------------------------------------------------------
 
 
-def film(cover: int, with_right: bool, moved: bool = False, count: int = 90) -> tuple[list[Pose], SpecimenTracking]:
+def film(cover: int, with_right: bool, moved: bool = False, count: int = 78) -> list[Pose]:
     """The left specimen is tracked and covered from frame 20 on; with ``moved`` it then is at the right place."""
     start = frame(bench(True, False), 0.0, 0)[1] @ LEFT
     session = SpecimenTracking(assembly_views(), CAMERA, assembly(), initial_cam_from_model=start)
@@ -354,7 +354,7 @@ def film(cover: int, with_right: bool, moved: bool = False, count: int = 90) -> 
         if 20 <= i < 20 + cover:
             wide = covered(wide, LEFT)
         results.append(session.process(frame(wide, 3.0 * np.sin(i / 12.0), i)[0], i, i / 30.0))
-    return results, session
+    return results
 
 
 def specimen(pose: Pose) -> str:
@@ -370,9 +370,9 @@ def specimen(pose: Pose) -> str:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("cover", [5, 40])
+@pytest.mark.parametrize("cover", [5, 20])
 def test_labels_never_go_over_to_another_specimen(cover: int) -> None:
-    results, _ = film(cover, with_right=True)
+    results = film(cover, with_right=True)
     assert [specimen(pose) for pose in results[5:20]] == ["L"] * 15
     assert all(not pose.is_label_withheld for pose in results[:20])
     labelled = {specimen(pose) for pose in results if pose.cam_from_model is not None and not pose.is_label_withheld}
@@ -383,19 +383,18 @@ def test_labels_never_go_over_to_another_specimen(cover: int) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("cover", [5, 40])
-def test_a_lone_part_has_its_labels_back_within_a_second_of_each_lock(cover: int) -> None:
-    results, _ = film(cover, with_right=False)
+def test_a_lone_part_has_its_labels_back_within_a_second_of_each_lock() -> None:
+    results = film(20, with_right=False)
     assert TrackingState.LOST in {pose.state for pose in results}
     assert specimen(results[-1]) == "L"
-    found = next(i for i in range(22, 90) if specimen(results[i]) == "L" and results[i - 1].cam_from_model is None)
-    assert all(not pose.is_label_withheld for pose in results[found + 30 :])
+    found = next(i for i in range(22, 78) if specimen(results[i]) == "L" and results[i - 1].cam_from_model is None)
+    assert results[found + 30 :] and all(not pose.is_label_withheld for pose in results[found + 30 :])
     assert sum(pose.is_label_withheld for pose in results) <= 30
 
 
 @pytest.mark.slow
 def test_a_lone_part_that_was_carried_to_another_place_is_followed() -> None:
-    results, _ = film(10, with_right=False, moved=True)
-    found = next(i for i in range(30, 90) if specimen(results[i]) == "R")
+    results = film(10, with_right=False, moved=True)
+    found = next(i for i in range(30, 78) if specimen(results[i]) == "R")
     assert all(pose.identity is Identity.FOLLOWED for pose in results[found + 30 :])
     assert len(results[found + 30 :]) > 10

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import os
 import signal
 import subprocess
 import time
@@ -14,55 +13,30 @@ import numpy as np
 import pytest
 
 from arview.cad import load_part
-from arview.cad.model import Model, make_model
 from arview.errors import InputError
-from arview.geometry import Array, rigid
+from arview.geometry import Array
 from arview.inspection import Inspection, Verdict
 from arview.station.walk.job import JobFolder, start_worker
 from arview.station.walk.merged import before_after, merged
-from helpers.cad_files import obj_text
-from helpers.photo_scene import bench, photograph, ring
-
-WRONG_MM = np.array([2.5, -1.0, 0.0])
-PART = (
-    '[part]\nname = "bench"\ncad = "part.obj"\nunit = "mm"\n[components.plate]\nrole = "base"\n'
-    + "".join(f"[components.block_{i}]\nposition_tolerance_mm = 1.5\n" for i in (1, 2, 3, 4))
-)  # fmt: skip
-POSES = ring(12, distance_mm=460.0)
-AGAIN = ring(7, distance_mm=430.0)[:6]
-
-
-def part_model() -> Model:
-    return make_model("part", bench().components[1:])
+from helpers.walk_bench import AGAIN, PART, POSES, WRONG_MM, part_model, photo, write_part
 
 
 class Station:
     """A part on a bench, of which block_2 stands wrong until it is put right."""
 
     def __init__(self, folder: Path) -> None:
-        self.folder, self.environment = folder, os.environ | {"XDG_CACHE_HOME": str(folder / "cache")}
-        text, offset = "", 0
-        for one in part_model().components:
-            text += obj_text(one.name, one.vertices_in_model, one.faces.astype(np.int64), offset)
-            offset += len(one.vertices_in_model)
-        (folder / "part.obj").write_text(text, encoding="utf-8")
-        (folder / "part.toml").write_text(PART, encoding="utf-8")
-        self.wrong = [self.photo(pose, WRONG_MM) for pose in POSES]
-
-    def photo(self, pose: Array, shift_mm: Array) -> bytes:
-        picture = photograph(bench(), pose, moves={"block_2": rigid(np.eye(3), shift_mm)})
-        is_written, png = cv2.imencode(".png", picture)
-        assert is_written
-        return png.tobytes()
+        self.folder = folder
+        write_part(folder)
+        self.wrong = [photo(pose, False) for pose in POSES]
 
     def job(self, serial: str) -> JobFolder:
         part = load_part(self.folder / "part.toml")
         return JobFolder.create(self.folder / "jobs", part, self.folder / "part.toml", serial)
 
 
-def add(job: JobFolder, photo: bytes, pose: Array | None = None) -> None:
+def add(job: JobFolder, content: bytes, pose: Array | None = None) -> None:
     hint = None if pose is None else {"cam_from_model": pose.ravel().tolist()}
-    job.add_photo(photo, hashlib.sha256(photo).hexdigest(), "still", hint)
+    job.add_photo(content, hashlib.sha256(content).hexdigest(), "still", hint)
 
 
 def wait(worker: subprocess.Popen[bytes], job: JobFolder, stages: tuple[str, ...] = ("done", "failed")) -> None:
@@ -94,8 +68,8 @@ def measured(station: Station) -> JobFolder:
     """A job whose photos came with rough poses, measured up to the verdict."""
     job = station.job("A-1")
     with start_worker(job) as worker:
-        for photo, pose in zip(station.wrong, POSES, strict=True):
-            add(job, photo, pose)
+        for picture, pose in zip(station.wrong, POSES, strict=True):
+            add(job, picture, pose)
         job.end()
         wait(worker, job)
         assert job.state().stage == "done", (job.path / "worker.log").read_text() + job.state().text
@@ -126,7 +100,7 @@ def test_a_component_put_right_is_checked_again(measured: JobFolder, station: St
     recheck = measured.recheck(["block_2"])
     with start_worker(recheck) as worker:
         for pose in AGAIN:
-            add(recheck, station.photo(pose, np.zeros(3)))
+            add(recheck, photo(pose, True))
         recheck.end()
         wait(worker, recheck)
         assert worker.wait(600.0) == 0
@@ -175,15 +149,17 @@ def test_a_killed_worker_continues_to_the_same_numbers(measured: JobFolder, stat
     job = station.job("A-2")
     half = len(POSES) // 2
     with start_worker(job) as worker:
-        for photo, pose in zip(station.wrong[:half], POSES[:half], strict=True):
-            add(job, photo, pose)
-        time.sleep(3.0)
+        for picture, pose in zip(station.wrong[:half], POSES[:half], strict=True):
+            add(job, picture, pose)
+        ends = time.monotonic() + 120.0
+        while not any((job.path / "features").glob("*")) and time.monotonic() < ends:
+            time.sleep(0.05)
         worker.send_signal(signal.SIGKILL)
-    for photo, pose in zip(station.wrong[half:], POSES[half:], strict=True):
-        add(job, photo, pose)
+    for picture, pose in zip(station.wrong[half:], POSES[half:], strict=True):
+        add(job, picture, pose)
     job.end()
     killed = []
-    for step in ("matching", "placing", "adjusting", "finding the part", "components"):
+    for step in ("matching", "finding the part", "components"):
         with start_worker(job) as worker:
             ends = time.monotonic() + 300.0
             while job.state().step != step and worker.poll() is None and time.monotonic() < ends:
