@@ -1,4 +1,4 @@
-"""A walk around a small part on a bench, of which one block is misplaced until it is put right: files, photos, truth."""
+"""A walk around a small part on a bench, one block of which stands wrong until it is put right: photos and truth."""
 
 from __future__ import annotations
 
