@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from arview.core.messages import sentence
 from arview.station.capture import CaptureAdvice, ComponentNeed, capture_document, words
 from arview.station.live.server import clients
 from arview.station.live.stream import documents
@@ -280,9 +281,10 @@ def test_check_again_shows_before_and_after(chromium: Any, server: Running, jobs
 
 
 def test_a_german_page_says_in_german_what_the_station_says(chromium: Any, server: Running, jobs: ToldJobs) -> None:
-    way = words.BOTH(first=words.more_message(6, [words.LEFT] * 6), second=words.HIDDEN_ONE(name="bracket_2"))
+    more = words.more_message(6, [sentence("capture.left")] * 6)
+    way = sentence("capture.both", first=more, second=sentence("capture.hidden_one", name="bracket_2"))
     advice = CaptureAdvice(
-        False, 0, way, words.CLOSER(), 0.3, False, 4, (), "far",
+        False, 0, way, sentence("capture.closer"), 0.3, False, 4, (), "far",
         (ComponentNeed("post_1", 1, 1, None, False, words.lacking_message(3, True)),),
     )  # fmt: skip
     with opened(chromium, server, WATCH, PHONE, locale="de-DE") as page:
@@ -299,4 +301,4 @@ def test_a_german_page_says_in_german_what_the_station_says(chromium: Any, serve
     with opened(chromium, server, WATCH, PHONE) as page:
         capture(page, jobs)
         until(page, "document.querySelector('#job-hud .hud-text').textContent.includes('hidden')")
-        assert page.text_content("#job-hud .hud-text") == way.text
+        assert page.text_content("#job-hud .hud-text") == way
