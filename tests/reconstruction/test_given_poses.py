@@ -148,6 +148,14 @@ def test_a_quaternion_of_another_length_is_refused(tmp_path: Path) -> None:
         read_poses(folder)
 
 
+def test_a_name_that_is_no_text_is_refused(tmp_path: Path) -> None:
+    folder = write_colmap_text(tmp_path / "model", POSES)
+    content = (folder / "images.txt").read_bytes()
+    (folder / "images.txt").write_bytes(content.replace(NAMES[0].encode(), b"\x80.png"))
+    with pytest.raises(InputError, match="COLMAP model cannot be read"):
+        read_poses(folder)
+
+
 def test_photos_are_placed_by_given_poses(tmp_path: Path) -> None:
     """Poses with small errors, in a frame and unit of their own, give the true places after the adjustment."""
     poses = ring(12)[:8]

@@ -122,10 +122,10 @@ def _read_colmap(folder: Path) -> tuple[GivenPose, ...]:
     pycolmap = import_pycolmap()
     try:
         model = pycolmap.Reconstruction(str(folder))
+        images = sorted((image for image in model.images.values() if image.has_pose), key=lambda image: image.name)
     except (ValueError, RuntimeError, OSError, IndexError) as error:
         raise InputError(f"{folder}: the COLMAP model cannot be read ({error})") from error
     cameras = load_cameras(next(path for path in _camera_files(folder) if path.is_file()))
-    images = sorted((image for image in model.images.values() if image.has_pose), key=lambda image: image.name)
     return tuple(
         _given(image.name, cameras[str(image.camera_id)], np.asarray(image.cam_from_world().matrix()), folder)
         for image in images
