@@ -2,9 +2,10 @@
 
     python tools/benchmarks/fuzz --minutes 60
 
-Each target runs in a process of its own. Properties: no traceback but errors of one line, no hang (10 s of the
-processor), no memory above 1 GB, and no answer that differs from a plain reader's where there is one. Faults are
-printed, one for each cause, and their inputs kept. The exit code is 1 when there was one.
+Each target runs in a process of its own, or some together, which saves the start of each. Properties: no traceback but
+errors of one line, no hang (10 s of the processor), no memory above 1 GB, and no answer that differs from a plain
+reader's where there is one. Faults are printed, one for each cause, and their inputs kept. The exit code is 1 when
+there was one.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
@@ -31,32 +33,39 @@ DEADLINE_S = 900.0
 
 
 def worker(options: argparse.Namespace) -> None:
-    """Fuzz one target in this process; prints a JSON line with the number of inputs and the faults."""
+    """Fuzz a target, or several one after the other, in this process; prints a JSON line with inputs and faults."""
     from targets import fuzz
 
-    found = fuzz(options.worker, options.seed, options.examples, options.seconds, options.folder)
-    print(json.dumps(found))
+    for name in options.worker.split(","):
+        found = fuzz(name, options.seed, options.examples, options.seconds, options.folder)
+        print(json.dumps({"name": name, **found}), flush=True)
 
 
-def run_worker(name: str, seed: int, examples: int | None, seconds: float, folder: Path) -> dict[str, Any]:
-    """Run `worker` as a process; a crash of it is a fault, too."""
-    command = [sys.executable, str(HERE), "--worker", name, "--seed", str(seed), "--seconds", str(seconds)]
+def run_worker(
+    names: Sequence[str], seed: int, examples: int | None, seconds: float, folder: Path
+) -> dict[str, dict[str, Any]]:
+    """Run `worker` for some targets as a process; a crash of it is a fault, too, of the target that it was at."""
+    command = [sys.executable, str(HERE), "--worker", ",".join(names), "--seed", str(seed), "--seconds", str(seconds)]
     command += ["--folder", str(folder), *(["--examples", str(examples)] if examples else [])]
+    ended, printed, last = "", "", ""
     try:
         done = subprocess.run(
             command, capture_output=True, text=True, errors="replace", timeout=seconds + DEADLINE_S, check=False
         )
-    except subprocess.TimeoutExpired:
-        return {"inputs": 0, "faults": [[f"{name} process hangs", f"seed {seed}"]]}
-    lines = done.stdout.strip().splitlines()
-    if done.returncode == 0 and lines:
-        return dict(json.loads(lines[-1]))
-    kept = folder / f"crash-{name}-{seed}"
-    for path in (folder / name).glob("current*"):
-        kept.mkdir(parents=True, exist_ok=True)
-        shutil.copy(path, kept)
-    last = done.stderr.strip().splitlines()[-1:] or [""]
-    return {"inputs": 0, "faults": [[f"{name} process ended with {done.returncode}", f"{last[0]} (input in {kept})"]]}
+        printed, last = done.stdout, (done.stderr.strip().splitlines() or [""])[-1]
+        if done.returncode:
+            ended = f"process ended with {done.returncode}"
+    except subprocess.TimeoutExpired as error:
+        printed, ended = (error.stdout or b"").decode(errors="replace"), "process hangs"
+    found = {row["name"]: row for row in map(json.loads, printed.strip().splitlines())}
+    if ended or len(found) < len(names):
+        name = next((name for name in names if name not in found), names[-1])
+        kept = folder / f"crash-{name}-{seed}"
+        for path in (folder / name).glob("current*"):
+            kept.mkdir(parents=True, exist_ok=True)
+            shutil.copy(path, kept)
+        found[name] = {"inputs": 0, "faults": [[f"{name} {ended}", f"seed {seed} {last} (input in {kept})"]]}
+    return found
 
 
 def main() -> int:
@@ -64,6 +73,7 @@ def main() -> int:
     parser.add_argument("--minutes", type=float, help="how long, over all targets")
     parser.add_argument("--examples", type=int, help="inputs of each target instead of a time")
     parser.add_argument("--parallel", type=int, default=1, help="targets at a time")
+    parser.add_argument("--together", type=int, default=1, help="targets that share a process, one after the other")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--only", nargs="*", help="targets; default: all")
     parser.add_argument("--folder", type=Path, help="where inputs of faults are kept; default: a new temporary folder")
@@ -83,20 +93,21 @@ def main() -> int:
     inputs = dict.fromkeys(names, 0)
     faults: dict[str, str] = {}
 
-    def run_one(name: str, seed: int) -> None:
+    def run_some(chosen: Sequence[str], seed: int) -> None:
         if seed > options.seed and time.monotonic() > ends_s:  # in the first round every target is run
             return
-        found = run_worker(name, seed, options.examples, max(MIN_SLICE_S, slice_s), folder)
-        inputs[name] += found["inputs"]
-        for signature, text in found["faults"]:
-            if signature not in faults:
-                faults[signature] = text
-                print(f"fault: {signature}: {text}", flush=True)
+        for name, found in run_worker(chosen, seed, options.examples, max(MIN_SLICE_S, slice_s), folder).items():
+            inputs[name] += found["inputs"]
+            for signature, text in found["faults"]:
+                if signature not in faults:
+                    faults[signature] = text
+                    print(f"fault: {signature}: {text}", flush=True)
 
+    groups = [names[k : k + options.together] for k in range(0, len(names), options.together)]
     seed = options.seed
     with ThreadPoolExecutor(options.parallel) as pool:
         while seed == options.seed or (time.monotonic() < ends_s and not options.examples):
-            list(pool.map(partial(run_one, seed=seed), names))
+            list(pool.map(partial(run_some, seed=seed), groups))
             seed += 1
             print(f"{sum(inputs.values())} inputs, {len(faults)} faults", flush=True)
     print(f"{len(names)} targets: " + ", ".join(f"{name} {count}" for name, count in inputs.items()))
