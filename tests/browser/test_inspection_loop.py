@@ -23,8 +23,8 @@ from helpers.inspection_loop import Inspector, Stop, WalkSession, camera_script
 from helpers.live_client import running
 from helpers.live_sample import options
 from helpers.page import WATCH, opened
-from helpers.photo_scene import CAMERA
-from helpers.walk_bench import AGAIN, COMPONENT, POSES, WRONG_MM, photo, write_part
+from helpers.photo_scene import CAMERA, ring
+from helpers.walk_bench import AGAIN, COMPONENT, WRONG_MM, photo, write_part
 
 BY = "M. Lang"
 SERIAL = "PL-0417"
@@ -33,7 +33,7 @@ pytestmark = pytest.mark.slow
 
 
 def test_whole_inspection(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    first = [Stop(photo(pose, False, ".jpg"), pose) for pose in POSES]
+    first = [Stop(photo(pose, False, ".jpg"), pose) for pose in ring(9, distance_mm=460.0)]
     second = [Stop(photo(pose, True, ".jpg"), pose) for pose in AGAIN]
     walk, wrong_mm = [*first, *second], float(np.linalg.norm(WRONG_MM))
 

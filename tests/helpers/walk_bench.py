@@ -45,6 +45,6 @@ def photo(cam_from_model: Array, is_right: bool, kind: str = ".png") -> bytes:
     """A photo as a file, with the component where it belongs or not."""
     shift_mm = np.zeros(3) if is_right else WRONG_MM
     picture = photograph(bench(), cam_from_model, moves={COMPONENT: rigid(np.eye(3), shift_mm)})
-    is_written, content = cv2.imencode(kind, picture, [cv2.IMWRITE_JPEG_QUALITY, 97])
+    is_written, content = cv2.imencode(kind, picture)
     assert is_written
     return content.tobytes()

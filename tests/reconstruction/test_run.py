@@ -231,6 +231,7 @@ def test_photos_of_another_part_give_no_frame(
 ) -> None:
     """The photos are good, but the CAD is another part's: no scale, no frame, and it is said."""
     monkeypatch.setattr("arview.guideviews.cache.cache_folder", lambda: tmp_path)
+    monkeypatch.setattr("arview.reconstruction.scale.cad.FIRST_DETECTIONS", 2)
     write_obj(tmp_path / "other.obj", bracket())
     shutil.copytree(folder / "out" / "sparse", tmp_path / "out" / "sparse")
     shutil.copy(folder / "out" / "stages.json", tmp_path / "out")
