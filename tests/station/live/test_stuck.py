@@ -222,8 +222,9 @@ PATCHES = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("stuck", PATCHES)
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize(
+    ("stuck", "number"), [*((name, signal.SIGTERM) for name in PATCHES), ("event loop", signal.SIGINT)]
+)
 def test_the_first_signal_ends_the_program_within_five_seconds(
     tmp_path: Path, stuck: str, number: signal.Signals
 ) -> None:

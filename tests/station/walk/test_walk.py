@@ -81,7 +81,7 @@ def measured(station: Station) -> JobFolder:
 def test_the_verdict_comes_before_the_cloud(measured: JobFolder, station: Station) -> None:
     state = measured.state()
     assert (state.stage, state.inspection, state.is_rough) == ("done", "inspection.json", False)
-    assert state.placed == state.photos == 12 and state.cloud == "running"
+    assert state.placed == state.photos == len(POSES) and state.cloud == "running"
     assert state.seconds_after_last_photo is not None and not (measured.path / "cloud.ply").exists()
     found = measured.inspection(load_part(station.folder / "part.toml").model)
     assert found is not None and found.serial == "A-1"
@@ -171,7 +171,7 @@ def test_a_killed_worker_continues_to_the_same_numbers(measured: JobFolder, stat
         wait(worker, job)
         assert job.state().stage == "done", job.state().text
         assert stop(worker) < 5.0
-    assert len(job.photos()) == 12
+    assert len(job.photos()) == len(POSES)
     ours, others = numbers(job.inspection()), numbers(measured.inspection())
     for name, value in ours.items():
         assert value == pytest.approx(others[name], abs=1e-3), name
