@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import cache
 from pathlib import Path
 
@@ -19,6 +19,8 @@ from helpers.cad_files import box
 
 Picture = NDArray[np.uint8]
 CAMERA = Camera(640, 480, 720.0, 720.0, 319.5, 239.5, np.array([-0.06, 0.01, 0.0, 0.0, 0.0]))
+PAINT: Callable[[Array], Array] | None = None
+"""Grey values of points (N,3) of the model where they shall have no texture; tests set it."""
 _GRID = 48
 
 
@@ -75,7 +77,15 @@ def photograph(
     tone = np.concatenate([np.full(len(one.faces), tones.get(one.name, 0.8)) for one in model.components])
     texture_from_cam = np.stack([invert(place) @ invert(cam_from_model) for place in places])
     intrinsics = np.array([twice.fx, twice.fy, twice.cx, twice.cy])
-    grey = _shaded(face, inverse_depth, owner, light * tone, texture_from_cam, intrinsics, _grid(seed))
+    if PAINT is None:
+        grey = _shaded(face, inverse_depth, owner, light * tone, texture_from_cam, intrinsics, _grid(seed))
+    else:
+        v, u = np.nonzero(face >= 0)
+        seen, depth = face[v, u], 1.0 / inverse_depth[v, u]
+        in_cam = np.stack([(u - twice.cx) / twice.fx * depth, (v - twice.cy) / twice.fy * depth, depth], axis=1)
+        place = texture_from_cam[owner[seen]]
+        grey = np.full(face.shape, 30.0)
+        grey[v, u] = PAINT(np.einsum("nij,nj->ni", place[:, :3, :3], in_cam) + place[:, :3, 3]) * (light * tone)[seen]
     small = cv2.resize(grey, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
     through = _through_lens(small, camera)
     through += np.random.default_rng(int(abs(cam_from_model[:3].sum()) * 1e3) + seed).normal(0.0, noise, through.shape)

@@ -203,7 +203,7 @@ def test_plane_of_thin_sheet_without_texture(monkeypatch: pytest.MonkeyPatch) ->
     nominal = make_model("sheet", (Component("sheet", thin, faces),))
     shift = np.array([0.2, -0.1, 0.4])
     built = make_model("sheet", (Component("sheet", thin + shift, faces),))
-    monkeypatch.setattr(photo_scene, "_texture", lambda points, seed: np.full(len(points), 120.0))
+    monkeypatch.setattr(photo_scene, "PAINT", lambda points: np.full(len(points), 120.0))
     poses = ring(12)
     grays = [cv2.cvtColor(photograph(built, pose, seed=3), cv2.COLOR_RGB2GRAY) for pose in poses]
     views = views_of(grays, (CAMERA,) * 12, np.stack(poses), nominal, tuple(f"img_{index}" for index in range(12)))

@@ -125,13 +125,13 @@ def test_round_post_has_a_place_but_no_spin(method: Method) -> None:
 def painted(is_there: bool = True) -> dict[str, dict[Method, Move | NotMeasured]]:
     """Blocks of one grey on a darker plate: no texture at all. One of them is 32 mm from its place, or missing."""
 
-    def paint(points: Array, seed: int) -> Array:
+    def paint(points: Array) -> Array:
         return np.where(points[:, 2] > 0.01, 150.0, np.where(points[:, 2] > -7.9, 70.0, 30.0))
 
     away = place_of(NOMINAL, "block_4", (25.0, -20.0, 0.0), (0.0, 0.0, 0.0))
     places = PLACES | {"block_4": away if is_there else None}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(photo_scene, "_texture", paint)
+        patch.setattr(photo_scene, "PAINT", paint)
         views = views_on(NOMINAL, displaced(NOMINAL, places), 10)
     return measure_components_in_photos(views, None, NOMINAL, names=BLOCKS)
 
@@ -172,11 +172,11 @@ def test_thin_sheet_whose_narrow_face_is_not_seen() -> None:
     nominal = make_model("bench", (*plain.components, Component("sheet", vertices, faces.astype(np.int32))))
     place = place_of(nominal, "sheet", (0.4, -0.3, 0.2), (0.0, 0.0, 0.0))
 
-    def paint(points: Array, seed: int) -> Array:
+    def paint(points: Array) -> Array:
         return np.where(points[:, 2] > 0.01, 70.0 * 1.25 / 0.8, np.where(points[:, 2] > -7.9, 70.0, 30.0))
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(photo_scene, "_texture", paint)
+        patch.setattr(photo_scene, "PAINT", paint)
         views = views_on(nominal, displaced(nominal, {"sheet": place}), 12)
     move = measure_components_in_photos(views, None, nominal, names=["sheet"])["sheet"]["edges"]
     assert isinstance(move, Move), move

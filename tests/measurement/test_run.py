@@ -118,11 +118,11 @@ def test_a_datum_that_fails_does_not_stop_the_rest(reconstruction: MetricReconst
 def test_a_plane_without_texture_is_carried_by_its_edges(tmp_path: Path) -> None:
     """Everything is painted in one grey: datum A is measured by the borders and holes of its face."""
 
-    def paint(points: Array, seed: int) -> Array:
+    def paint(points: Array) -> Array:
         return np.where(points[:, 2] > 0.01, 150.0, 90.0)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(photo_scene, "_texture", paint)
+        patch.setattr(photo_scene, "PAINT", paint)
         painted = _photographed(tmp_path)
     found = measure(painted, part(), MeasureOptions(methods=("sweep", "edges")))
     system = found.datum_system
