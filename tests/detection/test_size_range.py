@@ -15,7 +15,7 @@ from arview.camera import Camera
 from arview.camera.read import guess_camera
 from arview.detection import Detector
 from arview.detection.detector import GLOBAL_SEARCH
-from arview.detection.search.global_search import GlobalSearch
+from arview.detection.search.global_search import GlobalSearch, search_distances_mm
 from arview.geometry import Array, apply, exp_so3, rigid
 from arview.guideviews import GuideViewOptions, GuideViewSet
 from arview.guideviews.cache import cached_guide_views
@@ -96,7 +96,7 @@ def test_only_a_wide_range_is_searched_in_two_parts() -> None:
     part = PartView(views())
     search = GlobalSearch(views(), part, CAMERA, GLOBAL_SEARCH, np.empty((0, 3, 3)))
     assert search.has_outer and len(search.banks) <= 20
-    spans_px = [CAMERA.fx * DIAMETER_MM / distance for distance in search._distances_mm]
+    spans_px = [CAMERA.fx * DIAMETER_MM / distance for distance in search_distances_mm(views(), CAMERA)]
     assert spans_px[0] > CAMERA.width and 45.0 < spans_px[1] < 60.0
 
 

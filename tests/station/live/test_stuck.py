@@ -138,7 +138,7 @@ def test_a_tracking_that_never_comes_back_is_replaced() -> None:
     subject.never.set()  # what the stuck thread answers now is nobody's
     time.sleep(0.2)
     assert feed.newest is not None and feed.newest.frame.frame_id == 2
-    assert all(one.frame.frame_id != 1 for one in feed._kept)
+    assert feed.find(1) is None and feed.find(2) is not None
     feed.close()
 
 
