@@ -14,7 +14,9 @@ from arview.core.messages import sentence
 from arview.station.capture import CaptureAdvice, ComponentNeed, capture_document, words
 from arview.station.live.server import clients
 from arview.station.live.stream import documents
+from arview.station.live.stream.subjects import Subjects
 from helpers import live_browser
+from helpers.inspection_loop import Stop, WalkSession
 from helpers.live_client import Running, running
 from helpers.live_sample import INSPECTION, loader, options
 from helpers.page import WATCH, opened, until
@@ -32,6 +34,14 @@ VISIBLE_TEXTS = """
   .filter((text) => /[a-z]{2}/i.test(text))"""
 ADVICE: dict[str, Any] = {}
 """What every pose says of the capture."""
+QUICK = {
+    "POLL_MS": "500",
+    "BIND_MS": "400",
+    "FIRST_PAUSE_MS": "300",
+    "DISK_PAUSE_MS": "1_500",
+    "LONGEST_PAUSE_MS": "3_000",
+}
+"""Of the page's pauses, a fifth; where they are tested, what comes after them is waited for."""
 pytestmark = pytest.mark.slow
 
 
@@ -51,8 +61,13 @@ def server() -> Iterator[Running]:
     def told(*of: Any, **more: Any) -> dict[str, Any]:
         return {**plain(*of, **more), **({"capture": dict(ADVICE)} if ADVICE else {})}
 
+    def session(subjects: Subjects, camera: Any) -> WalkSession:
+        return WalkSession(places, [one.name for one in subjects[0].part.model.components], camera)
+
+    places = [Stop(b"", pose) for pose in live_browser.truth()]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(clients, "pose_document", told)
+        patch.setattr(Subjects, "session", session)
         chosen = options(inspection=None, clients=4)
         with running(chosen, loader(chosen)) as one:
             yield one
@@ -113,7 +128,7 @@ def test_sha256_without_a_secure_context(chromium: Any, server: Running) -> None
 
 
 def test_photos_survive_a_reload_and_arrive_once(chromium: Any, server: Running, jobs: ToldJobs) -> None:
-    with opened(chromium, server, WATCH, PHONE) as page:
+    with opened(chromium, server, WATCH, PHONE, QUICK) as page:
         job = capture(page, jobs)
         jobs.is_gone = True
         for count in (1, 2):
@@ -133,7 +148,7 @@ def test_photos_survive_a_reload_and_arrive_once(chromium: Any, server: Running,
 
 
 def test_a_photo_that_arrives_damaged_is_sent_again(chromium: Any, server: Running, jobs: ToldJobs) -> None:
-    with opened(chromium, server, WATCH, PHONE) as page:
+    with opened(chromium, server, WATCH, PHONE, QUICK) as page:
         capture(page, jobs)
         jobs.lost = 1
         jobs.refusals = [
@@ -152,7 +167,7 @@ def test_a_photo_that_arrives_damaged_is_sent_again(chromium: Any, server: Runni
 
 def test_a_photo_is_taken_by_itself_once_for_each_number(chromium: Any, server: Running, jobs: ToldJobs) -> None:
     advise()
-    with opened(chromium, server, WATCH, PHONE) as page:
+    with opened(chromium, server, WATCH, PHONE, QUICK) as page:
         capture(page, jobs)
         until(page, lambda: page.locator("#job-hud .dome circle.wanted").count() == len(CELLS) - 1)
         page.wait_for_timeout(1000)
@@ -169,7 +184,7 @@ def test_a_photo_is_taken_by_itself_once_for_each_number(chromium: Any, server: 
 
 
 def test_result_comes_without_a_reload_and_is_signed(chromium: Any, server: Running, jobs: ToldJobs) -> None:
-    with opened(chromium, server, WATCH, PHONE) as page:
+    with opened(chromium, server, WATCH, PHONE, {**QUICK, "STALE_MS": "3_000"}) as page:
         job = capture(page, jobs)
         page.click("#job-hud .shutter")
         page.click("#job-hud .hud-done")
@@ -200,7 +215,7 @@ def test_result_comes_without_a_reload_and_is_signed(chromium: Any, server: Runn
         page.fill("#job-tick-by", "M. Lang")
         page.check("#job-step-1")
         until(page, lambda: any(name == "ticks" for name, _ in jobs.said))
-        page.wait_for_timeout(2500)
+        page.wait_for_timeout(1200)
         assert page.input_value("#job-note") == "bent in transport", "what is typed stays while news arrive"
         page.check("#job-ok-no")
         page.fill("#job-reason", "Scrap")
@@ -222,7 +237,7 @@ def test_result_comes_without_a_reload_and_is_signed(chromium: Any, server: Runn
 
 def test_a_photo_is_taken_for_a_decision(chromium: Any, server: Running, jobs: ToldJobs) -> None:
     found = {"verdict": "fail", "sentence": "", "components": components(), "created": ""}
-    with opened(chromium, server, WATCH, PHONE) as page:
+    with opened(chromium, server, WATCH, PHONE, QUICK) as page:
         job = capture(page, jobs)
         job.update(inspection=found, state={**job["state"], "stage": "done", "cloud": "done"})
         page.click("#job .component[data-name=post_1]")
@@ -245,12 +260,12 @@ def test_a_photo_is_taken_for_a_decision(chromium: Any, server: Running, jobs: T
         said = dict(jobs.said)["decisions"]
         assert said["photo"] == f"decisions/{hashlib.sha256(content).hexdigest()}.jpg" and said["note"] == "bent"
         page.click("#job .component[data-name=post_1]")
-        until(page, "document.querySelector('#job .job-drawing[alt^=\"Photo taken for\"]').naturalWidth > 0")
+        until(page, "document.querySelector('#job .job-drawing[alt^=\"Photo taken for\"]')?.naturalWidth > 0")
 
 
 def test_check_again_shows_before_and_after(chromium: Any, server: Running, jobs: ToldJobs) -> None:
     found = {"verdict": "fail", "sentence": "", "components": components(), "created": ""}
-    with opened(chromium, server, WATCH, PHONE) as page:
+    with opened(chromium, server, WATCH, PHONE, QUICK) as page:
         job = capture(page, jobs)
         rework = {
             "component": "post_1",
@@ -268,6 +283,7 @@ def test_check_again_shows_before_and_after(chromium: Any, server: Running, jobs
         again = jobs.jobs[f"{JOB}_r1"]
         assert again["components"] == ["post_1"]
         page.click("#job-hud .shutter")
+        until(page, lambda: "stored" in state(page))
         page.click("#job-hud .hud-done")
         until(page, lambda: again["state"]["stage"] == "measuring")
         row = {"name": "post_1", "before_mm": 1.36, "after_mm": 0.04, "verdict_before": "fail", "verdict_after": "pass"}
@@ -287,7 +303,7 @@ def test_a_german_page_says_in_german_what_the_station_says(chromium: Any, serve
         False, 0, way, sentence("capture.closer"), 0.3, False, 4, (), "far",
         (ComponentNeed("post_1", 1, 1, None, False, words.lacking_message(3, True)),),
     )  # fmt: skip
-    with opened(chromium, server, WATCH, PHONE, locale="de-DE") as page:
+    with opened(chromium, server, WATCH, PHONE, QUICK, locale="de-DE") as page:
         capture(page, jobs)
         advise(**{**capture_document(advice, JOB), "cells": "0" * len(CELLS)})
         until(page, "document.querySelector('#job-hud .hud-text').textContent.includes('verdeckt')")
@@ -298,7 +314,7 @@ def test_a_german_page_says_in_german_what_the_station_says(chromium: Any, serve
         found = page.evaluate(VISIBLE_TEXTS)
         assert len(found) > 10
         assert [text for text in found if ENGLISH.search(text)] == []
-    with opened(chromium, server, WATCH, PHONE) as page:
+    with opened(chromium, server, WATCH, PHONE, QUICK) as page:
         capture(page, jobs)
         until(page, "document.querySelector('#job-hud .hud-text').textContent.includes('hidden')")
         assert page.text_content("#job-hud .hud-text") == way

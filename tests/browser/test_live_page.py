@@ -21,6 +21,7 @@ from arview.station.live.stream.stamp import Stamp, stamp_strip
 from arview.station.live.stream.subjects import Subjects
 from arview.video import VideoSink
 from helpers import live_browser
+from helpers.inspection_loop import Stop, WalkSession
 from helpers.live_browser import closed, difference_mask, number_in, outline_errors_px, screenshot, true_mask
 from helpers.live_client import Running, running
 from helpers.live_sample import INSPECTION, loader, options
@@ -31,6 +32,8 @@ WIDTH, HEIGHT, FPS = 640, 360, 5
 COLOUR_GAP_PX = 7
 """A video has its colours at half the resolution, and its encoder smooths them: in narrower slots and holes the ghost
 and what is seen through it are one."""
+TRACKING = Subjects.session
+"""The session that tracks."""
 MEDIAN_PX, MAX_PX = 1.5, 4.0
 """Of the ghost's outline; of the part itself nothing may be further off in nineteen of twenty places."""
 
@@ -38,10 +41,11 @@ MEDIAN_PX, MAX_PX = 1.5, 4.0
 @pytest.fixture(scope="module", autouse=True)
 def told_sessions() -> Iterator[None]:
     """Sessions say what the tests want; the ghost of what they do not verify would be too faint to be measured."""
-    start = Subjects.session
+    places = [Stop(b"", pose) for pose in live_browser.truth()]
 
     def session(subjects: Subjects, camera: Camera) -> Any:
-        return Told(start(subjects, camera), [one.name for one in subjects[0].part.model.components])
+        names = [one.name for one in subjects[0].part.model.components]
+        return Told(WalkSession(places, names, camera), names)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Subjects, "session", session)
@@ -385,7 +389,8 @@ def test_inspection_changes(chromium: Any, tmp_path: Path) -> None:
         assert "0.50 mm" in row.text_content(), "the last good one stays"
 
 
-def test_outline_to_align_with(chromium: Any, inspection: Path) -> None:
+def test_outline_to_align_with(chromium: Any, inspection: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Subjects, "session", TRACKING)
     chosen = options(inspection=inspection, guide="az-30_el60_d640")
     with running(chosen, loader(chosen)) as one, opened(chromium, one, WATCH) as page:
         until(page, "document.body.dataset.state === 'align'")
@@ -396,7 +401,10 @@ def test_outline_to_align_with(chromium: Any, inspection: Path) -> None:
         assert 800 < is_yellow.sum() < 0.2 * is_yellow.size
 
 
-def test_the_bar_says_what_has_not_been_seen_yet(chromium: Any, server: Running) -> None:
+def test_the_bar_says_what_has_not_been_seen_yet(
+    chromium: Any, server: Running, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Subjects, "session", TRACKING)
     with opened(chromium, server, WATCH) as page:
         until(page, "window.drawn?.pose?.state === 'tracked' && window.drawn.pose.unverified.length > 0")
         until(page, lambda: "Not yet verified: " in page.inner_text("#state"))

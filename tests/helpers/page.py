@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import re
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
@@ -17,9 +18,17 @@ VIEWPORT = {"width": 680, "height": 640}
 
 @contextmanager
 def opened(
-    chromium: Any, server: Running, script: str = "", viewport: dict[str, int] = VIEWPORT, **settings: Any
+    chromium: Any,
+    server: Running,
+    script: str = "",
+    viewport: dict[str, int] = VIEWPORT,
+    constants: Mapping[str, str] | None = None,
+    **settings: Any,
 ) -> Iterator[Any]:
-    """The open page, with settings of the browser's context; at the end it is checked that it raised no errors."""
+    """The open page, with settings of the browser's context; at the end it is checked that it raised no errors.
+
+    The ``constants`` of the page's scripts have other values than usual, by their names; each is there.
+    """
     context = chromium.new_context(viewport=viewport, accept_downloads=True, **settings)
     page = context.new_page()
     troubles: list[str] = []
@@ -27,6 +36,9 @@ def opened(
     page.on("console", lambda said: troubles.append(said.text) if "Content Security" in said.text else None)
     if script:
         page.add_init_script(script)
+    left = dict(constants or {})
+    if left:
+        page.route("**/*.js", lambda route: _with_constants(route, dict(constants or {}), left))
     try:
         page.goto(f"http://127.0.0.1:{server.port}/?token={server.token}")
         yield page
@@ -37,6 +49,18 @@ def opened(
     finally:
         context.close()
     assert not troubles
+    assert not left, f"no script has {sorted(left)}"
+
+
+def _with_constants(route: Any, constants: Mapping[str, str], left: dict[str, str]) -> None:
+    """Answer a request for a script with some of its constants changed; those are no longer left."""
+    answer = route.fetch()
+    text = answer.text()
+    for name, value in constants.items():
+        text, count = re.subn(rf"\b{name} = [\d_.]+", f"{name} = {value}", text)
+        if count:
+            left.pop(name, None)
+    route.fulfill(response=answer, body=text)
 
 
 def until(page: Any, condition: str | Callable[[], Any], timeout_s: float = TIMEOUT_S) -> Any:
