@@ -17,6 +17,8 @@ UNSET = {
     "BatchOptions.scratch": "a machine whose system folder for temporary files is too small",
     "GuideViewOptions.crease_angle_deg": "recorded with the guide views, and read back from their files",
     "SessionOptions.detector": "hands the options of the detector to a session in Python",
+    "SessionOptions.finder": "an object of the caller, see docs/reference/plug-ins.md",
+    "SessionOptions.matcher": "an object of the caller, see docs/reference/plug-ins.md",
     "SparseOptions.first_features": "together with ``features`` it trades time for accuracy",
     "UncertaintyOptions.draws": "together with ``monte_carlo`` it trades time for accuracy",
 }

@@ -164,7 +164,7 @@ class PartSearch:
         searches = self._plan.searches(image, state, self.detector)
         covers = self.covers if self._plan.hides_parts(state) else ()
         shown = searched_picture(image, self.others, covers, self._views, self._camera)
-        is_bare = USE_BASE_DETECTION and components.may_be_bare
+        is_bare = USE_BASE_DETECTION and components.may_be_bare and self._options.finder is None
         found = self._detect(shown, state, searches)
         whole = next((one for one in found if not self.is_other(one.cam_from_model)), None)
         if whole is not None:
@@ -288,6 +288,8 @@ class PartSearch:
             if last is not None and state.frames_without_pose <= EAGER_FRAMES:
                 guesses = self._remembered(image, last)
             guesses = guesses or self._remembered(image)
+        if self._options.finder is not None:
+            return list(self._options.finder.detect(image))
         return self.detector.detect(image, max_results=1, guesses=guesses, searches=searches)
 
     def _remembered(self, image: NDArray[np.uint8], near: Array | None = None, min_score: float = 0.0) -> list[Array]:

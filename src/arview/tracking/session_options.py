@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
-from arview.detection import DetectorOptions
+import numpy as np
+from numpy.typing import NDArray
+
+from arview.detection import Detection, DetectorOptions
+from arview.tracking.tracker_options import Matcher
 
 TRACKED_QUALITY = 0.5
 """Quality needed to become ``tracked``."""
@@ -12,6 +18,14 @@ CRITICAL_QUALITY = 0.25
 """A tracked pose becomes ``critical`` only below this quality (hysteresis)."""
 LOST_QUALITY = 0.1
 """A pose below this quality for ``LOST_FRAMES`` frames is given up."""
+
+
+class Finder(Protocol):
+    """Finds the part in a picture, in place of `Detector`."""
+
+    def detect(self, image: NDArray[np.uint8], /) -> Sequence[Detection]:
+        """Poses of the part in a picture (H,W,3) uint8 RGB of the session's camera, best first."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -25,6 +39,8 @@ class SessionOptions:
         use_recheck: run the detector's local search where a tracked pose is far from the predicted one.
         use_appearance_memory: remember how the part looks while it is tracked, and look for that after a loss.
         detector: options of the detector; None chooses them by the declared range.
+        finder: asked for the part in place of the detector; what it finds is refined and judged as usual.
+        matcher: asked in each frame of a tracked part for points of it, which support the pose as its texture does.
     """
 
     use_region: bool = True
@@ -33,3 +49,5 @@ class SessionOptions:
     use_recheck: bool = True
     use_appearance_memory: bool = True
     detector: DetectorOptions | None = None
+    finder: Finder | None = None
+    matcher: Matcher | None = None

@@ -112,7 +112,7 @@ class SpecimenTracking:
             views,
             camera,
             model,
-            TrackerOptions(use_region=o.use_region, use_edge=o.use_edge, use_texture=o.use_texture),
+            TrackerOptions(use_region=o.use_region, use_edge=o.use_edge, use_texture=o.use_texture, matcher=o.matcher),
             recheck=LocalSearchRecheck(self.search.local) if o.use_recheck else None,
             part=self._part,
         )

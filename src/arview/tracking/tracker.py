@@ -35,6 +35,7 @@ from arview.refinement import (
     quality_of,
     relative_twist,
     value_bins,
+    with_points,
 )
 from arview.tracking.estimate import Estimate
 from arview.tracking.motion import innovation, normalised_covariance, squared_motion_distance
@@ -356,6 +357,13 @@ class Tracker:
             frame.found_share = len(matches.weights) / max(matches.tried, 1)
             if len(matches.weights) >= MIN_MATCHES and frame.found_share >= MIN_MATCH_SHARE:
                 frame.matches, frame.start = matches, self._texture.align(matches, predicted)
+        if self.options.matcher is not None:
+            part = self.refiner.part
+            points, pixels, weights = self.options.matcher.match(image, predicted @ part.body_from_model)
+            if len(weights):
+                points = points - part.views.center_in_model
+                frame.matches = with_points(frame.matches, points, pixels, weights)
+                frame.found_share = len(frame.matches.weights) / frame.matches.tried
         return frame
 
     def _update(self, frame: FrameContext, quality: float) -> None:

@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
 
 from arview.errors import InputError
+from arview.geometry import Array
 from arview.refinement import TRACK_STAGES, RefinerOptions, ShadingOptions, Stage, WorkingScaleOptions
 
 STAGES: tuple[Stage, ...] = TRACK_STAGES
@@ -13,17 +18,41 @@ SCALE, COLOR_SCALE = WorkingScaleOptions(), WorkingScaleOptions(max_enlargement=
 """Options of the pictures in which poses are refined and judged."""
 
 
+class PointMatches(NamedTuple):
+    """Points of a part that were found in a picture.
+
+    Attributes:
+        points_in_model: (N,3) mm.
+        pixels: (N,2) where each was found, with the distortion of the camera.
+        weights: (N,) 0–1; a point of weight 1 counts as one found to about a pixel.
+    """
+
+    points_in_model: Array
+    pixels: Array
+    weights: Array
+
+
+class Matcher(Protocol):
+    """Finds points of the part in a picture: a modality beside colours, edges and texture."""
+
+    def match(self, image: NDArray[np.uint8], cam_from_model: Array, /) -> PointMatches:
+        """Points of the part in a picture (H,W,3) uint8 RGB of the session's camera, near a predicted pose (4,4)."""
+        ...
+
+
 @dataclass(frozen=True)
 class TrackerOptions(RefinerOptions):
     """Options of the tracker, in addition to those of the refinement.
 
     Attributes:
         use_texture: match the part's own texture; needs the model's surface.
+        matcher: finds more points of the part.
         shading: as of the refinement, with fewer rounds and less weight than for a pose found by a search, because the
             errors of the brightness are common to many pixels and the tracked pose is nearly right.
     """
 
     use_texture: bool = True
+    matcher: Matcher | None = None
     shading: ShadingOptions = field(default_factory=lambda: ShadingOptions(gain=0.5, rounds=2))
 
     def __post_init__(self) -> None:

@@ -1,0 +1,94 @@
+"""A finder in place of the detector, and a matcher as one more modality, given to a session by its options."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from arview.detection import Detection
+from arview.geometry import Array, apply
+from arview.pose import TrackingState
+from arview.tracking import PointMatches, SessionOptions, Tracker, TrackerOptions, TrackingSession
+from helpers.synthetic import CAMERA, assembly, assembly_views, background, error, path, picture, wrong
+
+POSES = path(12)
+POINTS_MM = np.random.default_rng(3).uniform((0.0, 0.0, 12.0), (160.0, 120.0, 12.0), (60, 3))
+"""Points of the plate that a matcher finds."""
+
+
+@dataclass
+class ToldFinder:
+    """Finds the part where it is told, if at all."""
+
+    cams_from_model: list[Array]
+    asked: int = 0
+
+    def detect(self, image: NDArray[np.uint8]) -> list[Detection]:
+        assert image.shape == (CAMERA.height, CAMERA.width, 3)
+        self.asked += 1
+        return [Detection(pose, 0.9) for pose in self.cams_from_model]
+
+
+@dataclass
+class ToldMatcher:
+    """Finds points of the plate to ``noise_px``; the frames are those of `POSES` from the second on."""
+
+    noise_px: float
+    predicted: list[Array] = field(default_factory=list)
+
+    def match(self, image: NDArray[np.uint8], cam_from_model: Array) -> PointMatches:
+        self.predicted.append(cam_from_model)
+        pixels = CAMERA.project(apply(POSES[len(self.predicted)], POINTS_MM))
+        noise = np.random.default_rng(len(self.predicted)).normal(0.0, self.noise_px, pixels.shape)
+        return PointMatches(POINTS_MM, pixels + noise, np.ones(len(POINTS_MM)))
+
+
+def last_pose(finder: ToldFinder, monkeypatch: pytest.MonkeyPatch) -> tuple[TrackingState, Array | None]:
+    """State and pose after four frames; the detector itself is never asked."""
+    monkeypatch.setattr("arview.detection.Detector.detect", lambda *_, **__: pytest.fail("the detector was asked"))
+    session = TrackingSession.of(assembly_views(), CAMERA, assembly(), SessionOptions(finder=finder))
+    for index, truth in enumerate(POSES[:4]):
+        (pose,) = session.process(picture(truth, seed=index), index, index / 30.0)
+    assert finder.asked
+    return pose.state, pose.cam_from_model
+
+
+def test_what_a_finder_finds_is_refined_and_tracked(monkeypatch: pytest.MonkeyPatch) -> None:
+    state, found = last_pose(ToldFinder([wrong(POSES[0], np.random.default_rng(5), 4.0, 2.0)]), monkeypatch)
+    assert state is TrackingState.TRACKED and found is not None
+    mm, _, deg = error(found, POSES[3])
+    assert mm < 1.5 and deg < 0.5
+
+
+def test_what_is_not_found_is_not_tracked(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert last_pose(ToldFinder([]), monkeypatch) == (TrackingState.SEARCHING, None)
+
+
+def test_what_is_found_but_not_there_is_not_tracked() -> None:
+    finder = ToldFinder([POSES[0]])
+    session = TrackingSession.of(assembly_views(), CAMERA, assembly(), SessionOptions(finder=finder))
+    poses = [session.process(background(seed), seed, seed / 30.0)[0] for seed in range(3)]
+    assert finder.asked == 3 and {pose.state for pose in poses} == {TrackingState.SEARCHING}
+
+
+def test_points_of_a_matcher_support_the_pose() -> None:
+    """With colours alone the part is followed less exactly than with points that are found to 0.3 px as well."""
+    medians = []
+    matcher = ToldMatcher(0.3)
+    for one in (None, matcher):
+        tracker = Tracker(
+            assembly_views(), CAMERA, assembly(), TrackerOptions(use_edge=False, use_texture=False, matcher=one)
+        )
+        tracker.start(picture(POSES[0], seed=0), POSES[0])
+        errors = [
+            error(tracker.track(picture(truth, seed=k)).cam_from_model, truth)
+            for k, truth in enumerate(POSES[1:], start=1)
+        ]
+        medians.append(np.median(errors, axis=0))
+    assert len(matcher.predicted) == len(POSES) - 1
+    assert all(error(one, truth)[2] < 5.0 for one, truth in zip(matcher.predicted, POSES[1:], strict=True))
+    colors_only, with_points = medians
+    assert (with_points[1:] < 0.7 * colors_only[1:]).all() and with_points[0] < colors_only[0], medians
