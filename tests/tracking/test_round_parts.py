@@ -74,6 +74,9 @@ def test_a_turn_is_told_by_the_handle_that_stands_out() -> None:
 def test_a_turn_is_ambiguous_while_the_handle_is_hidden() -> None:
     frames = followed([HANDLE_AZIMUTH_DEG + 180.0 + 0.2 * k for k in range(16)], 0.0)
     later = [pose for pose, _ in frames[8:]]
+    assert max(degrees for _, degrees in frames) < 8.0, "the turn is held while nothing tells it"
+    sigmas_deg = [np.rad2deg(np.sqrt(np.linalg.eigvalsh(pose.covariance[:3, :3])[-1])) for pose in later]
+    assert min(sigmas_deg) > 20.0, "the covariance says that the turn is not known"
     assert {pose.state for pose in later} == {TrackingState.CRITICAL}
     assert all(pose.alternatives and pose.reason.startswith("ambiguous") for pose in later)
 

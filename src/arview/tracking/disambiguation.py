@@ -20,6 +20,8 @@ DECISION_MARGIN = 0.25
 """Sum over the frames of the differences in score that decides between two poses."""
 EVERY_FRAMES = 4
 """Every so many frames a nearly round part is compared with itself, turned about its axis."""
+FIRST_FRAMES = 2
+"""Frames after the part was found in each of which it is compared."""
 RADIUS_PX = 40.0
 """Half diameter of the part in the picture in which its outlines are compared."""
 MIN_CHANGE = 0.012
@@ -104,7 +106,8 @@ class RoundTurns:
     ) -> Array | None:
         """The turn (4,4) of the model at which the picture shows it, if that is not its pose; else None.
 
-        It is asked in each frame and mostly compares nothing. A turn must be better at two comparisons.
+        It is asked in each frame, and after the first ones mostly compares nothing. A turn must be better at two
+        comparisons.
 
         Args:
             image: (H,W,3) uint8 RGB of the camera's size.
@@ -113,7 +116,7 @@ class RoundTurns:
             colors: of part and background.
         """
         self._frames += 1
-        if self._axis is None or self._frames % EVERY_FRAMES:
+        if self._axis is None or (self._frames > FIRST_FRAMES and self._frames % EVERY_FRAMES):
             return None
         changes, evidence = self._compared(image, cam_from_model, colors)
         is_told = changes >= MIN_CHANGE
@@ -132,9 +135,18 @@ class RoundTurns:
         self._votes, self.fitting = 0, []
         return np.asarray(self._axis.turns[best])
 
+    @property
+    def unknown_twist(self) -> Array | None:
+        """The turn (6,) about the axis by 1 rad, as `Tracker.hold_turn` takes it, while it is not known."""
+        if self._axis is None or not self.fitting:
+            return None
+        arm = self._axis.point_in_model - self._center_in_model
+        return np.concatenate([self._axis.direction, np.cross(arm, self._axis.direction)])
+
     def reset(self) -> None:
         """Forget what was compared: the part was found anew."""
-        self._votes, self.fitting = 0, []
+        self._frames = self._votes = 0
+        self.fitting = []
 
     def _compared(self, image: NDArray[np.uint8], cam_from_model: Array, colors: ColorModel) -> tuple[Array, Array]:
         """Of each turn (T,): the share of the part's picture that it changes, and the evidence of what changes for it.

@@ -327,6 +327,7 @@ class SpecimenTracking:
         colors, covariance = self.tracker.state.appearance.colors, self.tracker.covariance(estimate)
         if (better := self._turns.better(image, pose, covariance, colors)) is not None:
             return self._restart(image, pose @ better), reason
+        self.tracker.hold_turn(self._turns.unknown_twist)
         if self._turns.fitting and not s.hypotheses and not reason:
             s.apply(Event.CONTRADICTED)
             return estimate, "ambiguous: it looks the same when it is turned; show another side"

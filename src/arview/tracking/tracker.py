@@ -213,11 +213,21 @@ class Tracker:
                 candidate = self._refine(frame, proposal)
                 if self._is_better(frame, candidate, proposal):
                     frame.best = candidate
+        if self.state.unknown_twist is not None:
+            frame.best = self._as_predicted(frame, self.state.unknown_twist)
         best = frame.found
         quality = self._quality(frame)
         self._update(frame, quality)
         cam_from_model = best.cam_from_body @ self.refiner.part.body_from_model
         return Estimate(cam_from_model, best.information, quality, best.evidence, self.state.motion.is_restless)
+
+    def hold_turn(self, twist: Array | None) -> None:
+        """Leave a turn (6,) as it is predicted, from the next frame on, because frames do not tell it; None: none.
+
+        Args:
+            twist: turn by 1 rad, on the right of the pose about the part's centre.
+        """
+        self.state.unknown_twist = twist
 
     # --- Propose ------------------------------------------------------------------------------------------
 
@@ -342,6 +352,15 @@ class Tracker:
         if frame.found.matches is not None and evidence.points_in_picture > MIN_IN_PICTURE:
             return quality_of(evidence.score + TEXTURE_SCORE * frame.found_share)
         return evidence.quality
+
+    def _as_predicted(self, frame: FrameContext, unknown_twist: Array) -> RefinedPose:
+        """The best pose with the predicted turn about an axis, and without what its information says of that turn."""
+        best = frame.found
+        turn_rad = float(relative_twist(frame.predicted, best.cam_from_body)[:3] @ unknown_twist[:3])
+        pose = apply_twist(best.cam_from_body, -turn_rad * unknown_twist)
+        told = best.information @ unknown_twist
+        information = best.information - np.outer(told, told) / max(float(told @ unknown_twist), 1e-12)
+        return best._replace(cam_from_body=pose, information=information)
 
     # --- State --------------------------------------------------------------------------------------------
 

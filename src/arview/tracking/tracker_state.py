@@ -30,6 +30,8 @@ class TrackerState:
         is_started: whether a frame has been tracked since the start.
         spread_px: standard deviation of the blur of the part's edges, px of the frame; 0 where it is not known.
         motion: how far poses usually are from the predicted ones.
+        unknown_twist: (6,) twist on the right of the pose, a turn about an axis of the part of which frames tell
+            nothing at present; None: there is none.
     """
 
     cam_from_body: Array
@@ -45,6 +47,7 @@ class TrackerState:
     is_started: bool = False
     spread_px: float = 0.0
     motion: MotionModel = field(default_factory=MotionModel)
+    unknown_twist: Array | None = None
 
 
 class RefinedPose(NamedTuple):
