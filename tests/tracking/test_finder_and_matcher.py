@@ -12,7 +12,7 @@ from arview.detection import Detection
 from arview.geometry import Array, apply
 from arview.pose import TrackingState
 from arview.tracking import PointMatches, SessionOptions, Tracker, TrackerOptions, TrackingSession
-from helpers.synthetic import CAMERA, assembly, assembly_views, background, error, path, picture, wrong
+from helpers.synthetic import CAMERA, assembly, assembly_views, background, error, path, picture, pose_from, wrong
 
 POSES = path(12)
 POINTS_MM = np.random.default_rng(3).uniform((0.0, 0.0, 12.0), (160.0, 120.0, 12.0), (60, 3))
@@ -25,11 +25,12 @@ class ToldFinder:
 
     cams_from_model: list[Array]
     asked: int = 0
+    quality: float = 0.9
 
     def detect(self, image: NDArray[np.uint8]) -> list[Detection]:
         assert image.shape == (CAMERA.height, CAMERA.width, 3)
         self.asked += 1
-        return [Detection(pose, 0.9) for pose in self.cams_from_model]
+        return [Detection(pose, self.quality) for pose in self.cams_from_model]
 
 
 @dataclass
@@ -61,6 +62,17 @@ def test_what_a_finder_finds_is_refined_and_tracked(monkeypatch: pytest.MonkeyPa
     assert state is TrackingState.TRACKED and found is not None
     mm, _, deg = error(found, POSES[3])
     assert mm < 1.5 and deg < 0.5
+
+
+def test_a_pose_is_no_surer_than_what_found_it_until_other_views_confirm_it() -> None:
+    """The picture supports the pose from the first frame on, but the finder gave it 0.7; then the camera goes round."""
+    truths = [pose_from(40.0 + angle_deg, 35.0, 520.0) for angle_deg in (0.0, 0.0, 3.0, 6.0, 9.0, 12.0, 15.0, 18.0)]
+    options = SessionOptions(finder=ToldFinder([truths[0]], quality=0.7))
+    session = TrackingSession.of(assembly_views(), CAMERA, assembly(), options)
+    poses = [session.process(picture(truth, seed=k), k, k / 30.0)[0] for k, truth in enumerate(truths)]
+    assert {pose.state for pose in poses} == {TrackingState.TRACKED}
+    assert [pose.quality for pose in poses[:4]] == [0.7] * 4
+    assert min(pose.quality for pose in poses[-2:]) > 0.9
 
 
 def test_what_is_not_found_is_not_tracked(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -65,6 +65,7 @@ class FoundPose(NamedTuple):
         alternatives: poses (4,4) that fit as well.
         rests_on_base: whether only the base was found, which says nothing of the other components.
         guide_cam_from_model: (4,4) guide pose to which it must stay near; None: it was not found by alignment.
+        quality: 0–1, probability by what found it that it is right; 1 for what was not found by the detector.
     """
 
     cam_from_model: Array
@@ -73,6 +74,7 @@ class FoundPose(NamedTuple):
     alternatives: tuple[Array, ...] = ()
     rests_on_base: bool = False
     guide_cam_from_model: Array | None = None
+    quality: float = 1.0
 
 
 class PartSearch:
@@ -170,7 +172,7 @@ class PartSearch:
         if whole is not None:
             if is_bare and state.state == TrackingState.LOST:
                 whole = self._turned(image, whole, components, state.frames_without_pose)
-            yield FoundPose(whole.cam_from_model, alternatives=whole.alternatives)
+            yield FoundPose(whole.cam_from_model, alternatives=whole.alternatives, quality=whole.quality)
         if searches != []:
             base = self.find_base(shown, searches, components, state.frames_without_pose) if is_bare else None
             if base is not None:
@@ -199,7 +201,8 @@ class PartSearch:
         if not found:
             return None
         base = self._turned(image, found[0], components, frames_lost)
-        return FoundPose(base.cam_from_model, math.inf, alternatives=base.alternatives, rests_on_base=True)
+        alternatives, quality = base.alternatives, base.quality
+        return FoundPose(base.cam_from_model, math.inf, alternatives=alternatives, rests_on_base=True, quality=quality)
 
     def find_whole(
         self, image: NDArray[np.uint8], components: AssemblyMonitor, cam_from_model: Array
@@ -208,7 +211,7 @@ class PartSearch:
         found = self._base.find_whole(image, self.detector, components, cam_from_model, LOCK_QUALITY)
         if found is None or self.is_other(found.cam_from_model):
             return None
-        return FoundPose(found.cam_from_model, alternatives=found.alternatives)
+        return FoundPose(found.cam_from_model, alternatives=found.alternatives, quality=found.quality)
 
     def is_base_due(self, components: AssemblyMonitor, is_restless: bool) -> bool:
         """Whether the base of a part that is followed is to be searched for again; asked in each frame."""

@@ -69,6 +69,8 @@ class SessionState:
         recent_poses: the last poses (4,4) with support, at most two, oldest first.
         last_sure_pose: (4,4) the last pose that was ``tracked``.
         hypotheses: near-symmetric alternatives of the present pose.
+        found_quality: 0–1, probability by what found the pose that it is right, until other views have confirmed it.
+        found_direction: (3,) unit vector, in the model frame, from which the part was seen when it was found.
         reason: why the last search found nothing.
         loss_reason: why the part was lost.
     """
@@ -88,6 +90,8 @@ class SessionState:
     recent_poses: tuple[Array, ...] = ()
     last_sure_pose: Array | None = None
     hypotheses: HypothesisSet = field(default_factory=lambda: HypothesisSet([]))
+    found_quality: float = 1.0
+    found_direction: Array | None = None
     reason: str = ""
     loss_reason: str = ""
 

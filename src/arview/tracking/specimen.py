@@ -9,6 +9,7 @@ transitions between the states are a table, see `session_state`.
 from __future__ import annotations
 
 import copy
+import math
 import time
 
 import numpy as np
@@ -22,7 +23,7 @@ from arview.core.messages import joined, sentence
 from arview.detection import RejectedHypothesis
 from arview.errors import MismatchError
 from arview.fiducials import SerialNumbers
-from arview.geometry import Array, invert
+from arview.geometry import Array, apply, invert
 from arview.guideviews import GuideViewSet
 from arview.pose import Identity, Pose, TrackingState
 from arview.tracking.diagnosis import diagnose_loss
@@ -41,6 +42,8 @@ LOST_FRAMES = 2
 """Frames in a row below ``LOST_QUALITY`` after which the part is lost."""
 CRITICAL_FRAMES = 45
 """Critical frames in a row after which the part is lost."""
+CONFIRMING_DEG = 10.0
+"""Angle between two directions of view; a pose that is ``tracked`` from both is right or symmetric."""
 MIN_IN_PICTURE = 0.25
 """Share of the outline inside the picture below which no pose is kept."""
 SAME_SPECIMEN = (Identity.FOLLOWED, Identity.CONFIRMED)
@@ -210,7 +213,7 @@ class SpecimenTracking:
         return Pose(
             cam_from_model=pose,
             covariance=self.tracker.covariance(estimate),
-            quality=estimate.quality,
+            quality=self._quality(estimate),
             state=self.state,
             time_s=time_s,
             index=index,
@@ -228,6 +231,20 @@ class SpecimenTracking:
             serial=known.serial,
             components=self.components.presence(pose, bool(self._state.hypotheses)),
         )
+
+    def _quality(self, estimate: Estimate) -> float:
+        """Quality of a pose: until other views have supported it, it is no surer than what found it."""
+        s = self._state
+        if s.found_direction is not None and self.state == TrackingState.TRACKED:
+            cosine = float(self._seen_from(estimate.cam_from_model) @ s.found_direction)
+            if cosine < math.cos(math.radians(CONFIRMING_DEG)):
+                s.found_quality, s.found_direction = 1.0, None
+        return min(estimate.quality, s.found_quality)
+
+    def _seen_from(self, cam_from_model: Array) -> Array:
+        """Unit vector (3,), in the model frame, from the part's centre towards the camera at a pose (4,4)."""
+        towards = -apply(cam_from_model, self.views.center_in_model) @ cam_from_model[:3, :3]
+        return np.asarray(towards / np.linalg.norm(towards))
 
     # --- Follow a pose ------------------------------------------------------------------------------------
 
@@ -291,6 +308,7 @@ class SpecimenTracking:
         if found.guide_cam_from_model is not None:
             s.reason = ALIGN
         s.hypotheses = _alternatives_of(found)
+        s.found_quality, s.found_direction = found.quality, self._seen_from(estimate.cam_from_model)
         self._turns.reset()
         s.begin(estimate.quality >= found.lock_quality)
         return estimate

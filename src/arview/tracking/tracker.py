@@ -63,9 +63,9 @@ SUPPORT_RATE = 0.2
 """Share by which that mean moves towards the support in a frame."""
 SCORE_RATE = 0.1
 """Share by which the usual score follows each frame."""
-OTHER_SCHEDULES_SHARE = 0.97
+OTHER_SCHEDULES_SHARE = 0.9
 """Share of the usual score in the working picture below which other schedules are tried."""
-OTHER_SCHEDULES_FINE_SHARE = 0.85
+OTHER_SCHEDULES_FINE_SHARE = 0.7
 """Share of the usual score in the finest picture, in which scores vary more, below which other schedules are tried."""
 NEAR_SCHEDULES_MIN_INNER_SHARE = 0.05
 """Share of design edges needed for schedules without colours, because the apparent outline of a rounded part moves with
