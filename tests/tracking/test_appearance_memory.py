@@ -16,9 +16,10 @@ from arview.geometry import Array, apply, rotation_angle_rad
 from arview.guideviews import GuideViewOptions, GuideViewSet, make_guide_views
 from arview.pose import TrackingState
 from arview.refinement.evidence import PoseEvidence
-from arview.tracking import Estimate, SessionOptions, SpecimenTracking, appearance_memory, search_plan
+from arview.tracking import Estimate, SessionOptions, SpecimenTracking, appearance_memory
 from arview.tracking import session as session_module
 from arview.tracking.appearance_memory import MAX_VIEWS, AppearanceMemory
+from arview.tracking.search import search_plan
 from arview.tracking.search.ncc_search import MAX_RESULTS
 from arview.tracking.search.view_crops import CROP_PX, ViewCropper
 from helpers.synthetic import CAMERA, RANGE, assembly, assembly_views, bracket, error, path, picture, pose_from

@@ -21,8 +21,8 @@ from arview.overlay import OverlayOptions, OverlayRenderer
 from arview.pose import Pose, TrackingState
 from arview.tracking import SpecimenTracking
 from arview.tracking.guide_pose import guide_names, guide_pose
-from arview.tracking.guided_init import GuidedInit
 from arview.tracking.part_search import ALIGN
+from arview.tracking.search.guided_init import GuidedInit
 from helpers.cad_files import box, obj_text
 from helpers.synthetic import CAMERA, RANGE, assembly, assembly_views, block, error, picture, pose_from
 

@@ -16,12 +16,12 @@ from arview.geometry import Array, apply, invert, rigid
 from arview.pose import Identity, Pose, TrackingState
 from arview.refinement.evidence import PoseEvidence
 from arview.tracking import Estimate, SpecimenTracking
-from arview.tracking.guided_init import GuidedPose
 from arview.tracking.identity import IdentityMonitor
 from arview.tracking.identity.background_motion import BackgroundMotion, reduced
 from arview.tracking.identity.doubt import ANOTHER_IN_VIEW, MOVED
 from arview.tracking.identity.monitor import CHECKING
 from arview.tracking.identity.part_outline import PartOutline, transfer
+from arview.tracking.search.guided_init import GuidedPose
 from helpers.synthetic import assembly, assembly_views
 from helpers.turning_bench import CAMERA, LEFT, RIGHT, bench, covered, frame
 

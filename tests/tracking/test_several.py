@@ -17,7 +17,7 @@ from arview.guideviews import GuideViewSet
 from arview.guideviews.cache import cached_guide_views
 from arview.pose import Pose, TrackingState
 from arview.tracking import SpecimenTracking, TrackedPart, TrackingSession
-from arview.tracking.search_plan import SEARCH_EVERY, SearchPlan
+from arview.tracking.search.search_plan import SEARCH_EVERY, SearchPlan
 from arview.tracking.session_state import SessionState
 from arview.tracking.several.specimens import hide_specimens, is_same_specimen, searched_picture
 from arview.video import Image

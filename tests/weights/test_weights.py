@@ -37,6 +37,6 @@ def test_the_inputs_of_a_network_are_those_of_the_manifest(name: str) -> None:
 def test_stored_arrays_and_regression_weights_are_those_of_the_manifest() -> None:
     arrays = load_arrays("profile_ranker.npz")
     assert {key: list(array.shape) for key, array in arrays.items()} == manifest()["profile_ranker.npz"]["inputs"]
-    for name in ("pose_confidence", "component_log_odds"):
+    for name in ("pose_confidence", "component_log_odds", "tracked_pose"):
         groups = load_weights(name)
         assert {key: list(group) for key, group in groups.items()} == manifest()[f"{name}.json"]["inputs"]

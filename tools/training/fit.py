@@ -17,6 +17,8 @@ Needs torch and onnx. The steps in their order; later ones learn from what the d
   fit.py presence-net                                      presence_net.onnx
   fit.py confidence --from 500 --solids 40 --photos DIR    prints the weights for pose_confidence.json
 
+  fit.py tracked-pose SCENE...                             quality of tracked poses, from sequences with truth
+
   fit.py backgrounds --solids 120 --photos DIR --things CUTOUTS    further backgrounds
 
 Examples and networks are written to out/training. To use a network, copy it to src/arview/weights and update its entry
@@ -66,6 +68,7 @@ from presence_net_examples import collect_components
 from presence_net_fitting import fit_presence_net
 from profile_ranker_examples import collect_pose_examples
 from profile_ranker_fitting import fit_profile_ranker
+from tracked_pose_fitting import fit_tracked_pose
 
 EXAMPLES: dict[str, Callable[[range, tuple[Path, ...], Path], None]] = {
     "edge-examples": collect_edge_pictures,
@@ -124,6 +127,10 @@ def parser() -> argparse.ArgumentParser:
     step.set_defaults(run=lambda chosen: fit_component_odds(chosen.folder))
     step = steps.add_parser("confidence", parents=[solids], help="fit the weights of the confidence")
     step.set_defaults(run=lambda chosen: fit_confidence(seeds_of(chosen), fitting_photos(chosen.photos)))
+    step = steps.add_parser("tracked-pose", parents=[folder], help="fit the quality of tracked poses")
+    step.add_argument("scenes", type=Path, nargs="+", metavar="SCENE", help="folders as `arview evaluate` takes them")
+    step.add_argument("--rotations", type=Path, nargs="+", default=[], metavar="SCENE", help="only rotations are exact")
+    step.set_defaults(run=lambda chosen: fit_tracked_pose(chosen.scenes, chosen.rotations, chosen.folder))
     step = steps.add_parser("backgrounds", parents=[solids, folder], help="make backgrounds of things on photos")
     step.add_argument("--things", type=Path, metavar="CUTOUTS", help="folder of pictures with transparency")
     step.set_defaults(run=run_backgrounds)

@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from arview.refinement.modalities.shading import ShadingOptions as ShadingOptions
     from arview.refinement.modalities.texture import TextureMatches as TextureMatches
     from arview.refinement.modalities.texture import TextureModality as TextureModality
-    from arview.refinement.modalities.texture import with_points as with_points
     from arview.refinement.projection import ProjectedLines as ProjectedLines
     from arview.refinement.projection import ViewArrays as ViewArrays
     from arview.refinement.projection import intrinsics_of as intrinsics_of
@@ -85,7 +84,6 @@ __getattr__, __dir__, __all__ = lazy_door(
         "modalities.texture": (
             "TextureMatches",
             "TextureModality",
-            "with_points",
         ),
         "projection": (
             "ProjectedLines",

@@ -12,12 +12,10 @@ if TYPE_CHECKING:
     from arview.tracking.self_calibration.profile import keep_profile as keep_profile
     from arview.tracking.session import TrackedPart as TrackedPart
     from arview.tracking.session import TrackingSession as TrackingSession
-    from arview.tracking.session_options import Finder as Finder
     from arview.tracking.session_options import SessionOptions as SessionOptions
     from arview.tracking.several.specimens import specimen_names as specimen_names
     from arview.tracking.specimen import SpecimenTracking as SpecimenTracking
     from arview.tracking.tracker import Tracker as Tracker
-    from arview.tracking.tracker_options import Matcher as Matcher
     from arview.tracking.tracker_options import PointMatches as PointMatches
     from arview.tracking.tracker_options import TrackerOptions as TrackerOptions
 
@@ -33,15 +31,11 @@ __getattr__, __dir__, __all__ = lazy_door(
             "TrackedPart",
             "TrackingSession",
         ),
-        "session_options": (
-            "Finder",
-            "SessionOptions",
-        ),
+        "session_options": ("SessionOptions",),
         "several.specimens": ("specimen_names",),
         "specimen": ("SpecimenTracking",),
         "tracker": ("Tracker",),
         "tracker_options": (
-            "Matcher",
             "PointMatches",
             "TrackerOptions",
         ),

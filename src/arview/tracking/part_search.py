@@ -27,8 +27,8 @@ from arview.refinement import PartView
 from arview.tracking.appearance_memory import AppearanceMemory
 from arview.tracking.base_detection import BaseDetection
 from arview.tracking.diagnosis import NOTHING_IN_VIEW, diagnose_picture, diagnose_search
-from arview.tracking.guided_init import GuidedInit, GuidedPose
-from arview.tracking.search_plan import EAGER_FRAMES, SearchPlan
+from arview.tracking.search.guided_init import GuidedInit, GuidedPose
+from arview.tracking.search.search_plan import EAGER_FRAMES, SearchPlan
 from arview.tracking.session_options import TRACKED_QUALITY, SessionOptions
 from arview.tracking.session_state import SessionState
 from arview.tracking.several.specimens import CoveredPlace, is_same_specimen, searched_picture

@@ -32,6 +32,7 @@ from arview.tracking.estimate import Estimate
 from arview.tracking.identity import IdentityMonitor
 from arview.tracking.part_search import ALIGN, FoundPose, PartSearch
 from arview.tracking.pose_recheck import LocalSearchRecheck
+from arview.tracking.probability import pose_features, pose_probability
 from arview.tracking.session_options import CRITICAL_QUALITY, LOST_QUALITY, TRACKED_QUALITY, SessionOptions
 from arview.tracking.session_state import Event, SessionState
 from arview.tracking.several.specimens import CoveredPlace
@@ -209,11 +210,11 @@ class SpecimenTracking:
                 reason=reason,
                 guide_cam_from_model=self.search.guide_pose(self._state),
             )
-        pose = estimate.cam_from_model
+        pose, covariance = estimate.cam_from_model, self.tracker.covariance(estimate)
         return Pose(
             cam_from_model=pose,
-            covariance=self.tracker.covariance(estimate),
-            quality=self._quality(estimate),
+            covariance=covariance,
+            quality=self._quality(estimate, covariance),
             state=self.state,
             time_s=time_s,
             index=index,
@@ -232,14 +233,14 @@ class SpecimenTracking:
             components=self.components.presence(pose, bool(self._state.hypotheses)),
         )
 
-    def _quality(self, estimate: Estimate) -> float:
+    def _quality(self, estimate: Estimate, covariance: Array) -> float:
         """Quality of a pose: until other views have supported it, it is no surer than what found it."""
         s = self._state
         if s.found_direction is not None and self.state == TrackingState.TRACKED:
             cosine = float(self._seen_from(estimate.cam_from_model) @ s.found_direction)
             if cosine < math.cos(math.radians(CONFIRMING_DEG)):
                 s.found_quality, s.found_direction = 1.0, None
-        return min(estimate.quality, s.found_quality)
+        return min(pose_probability(pose_features(estimate, covariance, self.views.diameter_mm)), s.found_quality)
 
     def _seen_from(self, cam_from_model: Array) -> Array:
         """Unit vector (3,), in the model frame, from the part's centre towards the camera at a pose (4,4)."""

@@ -35,8 +35,8 @@ from arview.refinement import (
     quality_of,
     relative_twist,
     value_bins,
-    with_points,
 )
+from arview.tracking.covariance import common_covariance, covariance_of
 from arview.tracking.estimate import Estimate
 from arview.tracking.motion import innovation, normalised_covariance, squared_motion_distance
 from arview.tracking.search.wide_search import WideSearch
@@ -102,8 +102,8 @@ EXPOSURE_LIMITS = (0.2, 5.0)
 """Smallest and largest exposure relative to the first frame."""
 SPREAD_RATE = 0.3
 """Share by which the estimated blur of the edges follows each frame."""
-CORRELATED_POINTS = 8.0
-"""Neighbouring edge points that share one error."""
+CAUTION = 0.5
+"""Factor by which fewer edge points share one error where a pose is compared with the truth instead of the last one."""
 VELOCITY_DECAY = 0.9
 """Share of the last frame's motion that is expected in the next frame."""
 
@@ -219,7 +219,10 @@ class Tracker:
         quality = self._quality(frame)
         self._update(frame, quality)
         cam_from_model = best.cam_from_body @ self.refiner.part.body_from_model
-        return Estimate(cam_from_model, best.information, quality, best.evidence, self.state.motion.is_restless)
+        texture_share = 0.0 if best.matches is None else frame.found_share
+        return Estimate(
+            cam_from_model, best.information, quality, best.evidence, self.state.motion.is_restless, texture_share
+        )
 
     def hold_turn(self, twist: Array | None) -> None:
         """Leave a turn (6,) as it is predicted, from the next frame on, because frames do not tell it; None: none.
@@ -335,7 +338,7 @@ class Tracker:
     def _innovation(self, frame: FrameContext) -> tuple[Array, Array]:
         """Difference (6,) of the best pose from the predicted one, and covariance (6,6) of the best pose."""
         best = frame.found
-        covariance = self._covariance(best.information, best.evidence.quality)
+        covariance = covariance_of(best.information, best.evidence.quality, self.diameter_mm)
         difference = innovation(best.cam_from_body, frame.predicted, self.diameter_mm)
         return difference, normalised_covariance(covariance, best.cam_from_body, self.diameter_mm)
 
@@ -378,10 +381,9 @@ class Tracker:
                 frame.matches, frame.start = matches, self._texture.align(matches, predicted)
         if self.options.matcher is not None:
             part = self.refiner.part
-            points, pixels, weights = self.options.matcher.match(image, predicted @ part.body_from_model)
-            if len(weights):
-                points = points - part.views.center_in_model
-                frame.matches = with_points(frame.matches, points, pixels, weights)
+            points = self.options.matcher.match(image, predicted @ part.body_from_model)
+            if len(points.weights):
+                frame.matches = points.joined(frame.matches, part.views.center_in_model)
                 frame.found_share = len(frame.matches.weights) / frame.matches.tried
         return frame
 
@@ -478,14 +480,8 @@ class Tracker:
     def covariance(self, estimate: Estimate) -> Array:
         """Covariance (6,6) of the twist (rad, mm) about the model's centre.
 
-        It is the inverse of the information, enlarged by the number of edge points that share an error, because the
-        points along one edge are measured every few pixels, and limited by half a radian and half a diameter.
+        It holds for the error of the pose in this frame, see `common_covariance`.
         """
-        return self._covariance(estimate.information, estimate.quality)
-
-    def _covariance(self, information: Array, quality: float) -> Array:
-        """Covariance (6,6) for an information (6,6) and the quality of its pose, see `covariance`."""
-        scale = CORRELATED_POINTS / max(quality, 0.05)
-        max_sigma = np.array([0.5] * 3 + [0.5 * self.diameter_mm] * 3)
-        covariance = np.linalg.inv(information / scale + np.diag(1.0 / max_sigma**2))
-        return np.asarray(covariance, dtype=np.float64)
+        cam_from_body = estimate.cam_from_model @ self.refiner.part.model_from_body
+        own = covariance_of(estimate.information / CAUTION, estimate.quality, self.diameter_mm)
+        return own + common_covariance(cam_from_body, self.refiner.radius_px(cam_from_body), self.diameter_mm)

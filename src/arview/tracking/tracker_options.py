@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from arview.errors import InputError
 from arview.geometry import Array
-from arview.refinement import TRACK_STAGES, RefinerOptions, ShadingOptions, Stage, WorkingScaleOptions
+from arview.refinement import TRACK_STAGES, RefinerOptions, ShadingOptions, Stage, TextureMatches, WorkingScaleOptions
 
 STAGES: tuple[Stage, ...] = TRACK_STAGES
 """Schedule of a usual frame."""
@@ -30,6 +30,18 @@ class PointMatches(NamedTuple):
     points_in_model: Array
     pixels: Array
     weights: Array
+
+    def joined(self, matches: TextureMatches | None, center_in_model: Array) -> TextureMatches:
+        """These points after those found by the texture, about the centre (3,) of the part."""
+        points = self.points_in_model - center_in_model
+        if matches is None:
+            return TextureMatches(points, self.pixels, self.weights, len(points))
+        return TextureMatches(
+            np.concatenate([matches.points_in_body, points]),
+            np.concatenate([matches.pixels, self.pixels]),
+            np.concatenate([matches.weights, self.weights]),
+            matches.tried + len(points),
+        )
 
 
 class Matcher(Protocol):

@@ -7,8 +7,8 @@ import time
 import numpy as np
 
 from arview.geometry import Array, apply, exp_so3, rigid, rotation_angle_rad
-from arview.tracking.guided_init import GuidedInit
 from arview.tracking.part_search import LOCK_QUALITY
+from arview.tracking.search.guided_init import GuidedInit
 from arview.video import Image
 from arview_lab.evaluation import PoseMeter, Scene, scene_guide_views
 from arview_lab.evaluation.protocols import box_symmetries

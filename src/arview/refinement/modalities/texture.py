@@ -67,18 +67,6 @@ class TextureMatches(NamedTuple):
     tried: int
 
 
-def with_points(matches: TextureMatches | None, points_in_body: Array, pixels: Array, weights: Array) -> TextureMatches:
-    """Matches with more points, found by another way; see `TextureMatches` for the arguments."""
-    if matches is None:
-        return TextureMatches(points_in_body, pixels, weights, len(weights))
-    return TextureMatches(
-        np.concatenate([matches.points_in_body, points_in_body]),
-        np.concatenate([matches.pixels, pixels]),
-        np.concatenate([matches.weights, weights]),
-        matches.tried + len(weights),
-    )
-
-
 class TextureModality:
     """Texture of one part, matched from a bank of keyframes.
 

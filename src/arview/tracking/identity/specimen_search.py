@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from arview.detection import Detection
 from arview.geometry import Array, exp_so3, rigid
-from arview.tracking.guided_init import GuidedPose
 from arview.tracking.identity.part_outline import PartOutline, PartPlace
+from arview.tracking.search.guided_init import GuidedPose
 from arview.tracking.several.specimens import hide_specimens
 
 FOUND_QUALITY = 0.7

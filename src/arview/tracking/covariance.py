@@ -1,0 +1,36 @@
+"""Covariance of a tracked pose: what each edge point measures for itself, and what all points of a frame share."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from arview.geometry import Array
+
+CORRELATED_POINTS = 8.0
+"""Neighbouring edge points that share one error, because points along one edge are measured every few pixels."""
+COMMON_SHIFT_PX, COMMON_SIZE_PX = 0.6, 0.3
+"""Standard deviations of what all points share: a shift, and a change of the part's radius or its turn. Errors of lens,
+CAD and light do not average out."""
+
+
+def covariance_of(information: Array, quality: float, diameter_mm: float) -> Array:
+    """Covariance (6,6) of a twist (rad, mm) for an information (6,6) and the quality of its pose.
+
+    It is the inverse of the information, enlarged by the number of points that share an error, and limited by half a
+    radian and half a diameter.
+    """
+    scale = CORRELATED_POINTS / max(quality, 0.05)
+    max_sigma = np.array([0.5] * 3 + [0.5 * diameter_mm] * 3)
+    covariance = np.linalg.inv(information / scale + np.diag(1.0 / max_sigma**2))
+    return np.asarray(covariance, dtype=np.float64)
+
+
+def common_covariance(cam_from_body: Array, radius_px: float, diameter_mm: float) -> Array:
+    """Covariance (6,6) of the errors that all points of a frame share, at a pose (4,4) of a part of some radius."""
+    across_mm = COMMON_SHIFT_PX / radius_px * 0.5 * diameter_mm
+    along_mm = COMMON_SIZE_PX / radius_px * max(float(cam_from_body[2, 3]), 0.0)
+    covariance = np.zeros((6, 6))
+    covariance[:3, :3] = (COMMON_SIZE_PX / radius_px) ** 2 * np.eye(3)
+    axes = np.diag(np.square([across_mm, across_mm, along_mm]))
+    covariance[3:, 3:] = cam_from_body[:3, :3].T @ axes @ cam_from_body[:3, :3]
+    return covariance
