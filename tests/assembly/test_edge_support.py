@@ -54,7 +54,7 @@ def views_of(model: Model) -> GuideViewSet:
     return cached_guide_views(model, RANGE, GuideViewOptions(renderer="zbuffer"))
 
 
-def observed(model: Model, count: int = 6, of: Model | None = None, absent: tuple[str, ...] = ()) -> list[Observation]:
+def observed(model: Model, count: int = 4, of: Model | None = None, absent: tuple[str, ...] = ()) -> list[Observation]:
     """Observations of a model that should be another, of which some components are known to be absent."""
     whole = of or ribbed()
     observer = ComponentObserver(views_of(whole), CAMERA, whole)

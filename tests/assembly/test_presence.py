@@ -65,7 +65,6 @@ def card_over(name: str, pose: Array, margin_px: int = 30) -> tuple[int, int, in
     "absent",
     [
         ("post_2",),
-        ("post_1", "block_2"),
         ("post_1", "post_3", "block_1"),
         ("post_1", "post_2", "post_3", "block_2", "rail"),
     ],
@@ -103,7 +102,7 @@ def test_nothing_of_a_right_part_is_ever_missing(noise: float) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["post_1", "post_3", "block_2"])
+@pytest.mark.parametrize("name", ["post_1", "block_2"])
 def test_a_component_behind_something_is_not_missing(name: str) -> None:
     poses = [pose_from(-60 + 20 * k, 45, 520) for k in range(6)]
     frames = [

@@ -74,10 +74,10 @@ def test_projection_is_that_of_opencv_and_its_derivatives_are_right() -> None:
 
 @pytest.mark.slow
 def test_u_of_a_fisheye_holds_the_truth_as_often_as_it_says() -> None:
-    """20 calibrations from corners with noise of 0.1 px: 160 numbers, and the places of rays."""
+    """12 calibrations from corners with noise of 0.1 px: 96 numbers, and the places of rays."""
     z, within, off_px = [], [], []
     grid = seen_grid()
-    for seed in range(20):
+    for seed in range(12):
         solution = solve(corners_of(FISHEYE, np.random.default_rng(seed), 18), 960, 720, lens=CalibratedLens.FISHEYE)
         assert not solution.rejected
         z.append((intrinsics_of(solution.camera) - intrinsics_of(FISHEYE)) / solution.std)
@@ -123,16 +123,16 @@ def test_the_lens_model_that_fits_is_recommended() -> None:
 
 @pytest.mark.slow
 def test_pictures_of_a_fisheye(tmp_path: Path) -> None:
-    """28 rendered pictures with blur and noise: the camera, and the command with either lens."""
+    """22 rendered pictures with blur and noise: the camera, and the command with either lens."""
     rng = np.random.default_rng(11)
     folder = tmp_path / "photos"
     folder.mkdir()
-    for k in range(28):
+    for k in range(22):
         picture = photograph(BOARD, FISHEYE, wide_pose(BOARD, rng, 55.0), rng)
         cv2.imwrite(str(folder / f"p{k:02}.png"), picture)
     result = calibrate([folder], BOARD, lens=CalibratedLens.FISHEYE)
     camera = result.camera
-    assert len(result.solution.views) >= 20
+    assert len(result.solution.views) >= 17
     assert abs(camera.fx / FISHEYE.fx - 1.0) < 0.002
     assert np.hypot(camera.cx - FISHEYE.cx, camera.cy - FISHEYE.cy) < 0.5
     off = np.linalg.norm(pixel_difference(FISHEYE, camera, seen_grid()), axis=1)

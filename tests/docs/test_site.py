@@ -13,14 +13,15 @@ import sys
 from pathlib import Path
 from typing import NamedTuple
 
-import av
 import pytest
+
+from arview.video import VideoSink, open_source
 
 ROOT = Path(__file__).parents[2]
 PAGES = sorted((ROOT / "docs").rglob("*.md"))
 BLOCK = re.compile(r"^```(\w+)(?: title=\"([^\"]+)\")?\n(.*?)^```$", re.MULTILINE | re.DOTALL)
-CLIP, FRAMES = ROOT / "samples" / "bracket_plate" / "clip.mp4", 34
-"""A clip that the examples track, and the number of its frames that they are given: the part is in view from 20 on."""
+CLIP, START, END = ROOT / "samples" / "bracket_plate" / "clip.mp4", 20, 35
+"""A clip that the examples track, and its frames that they are given: the part is in full view in them."""
 LINK = re.compile(r"\]\(([^)#:]+)(?:#[^)]*)?\)")
 
 
@@ -37,27 +38,24 @@ def blocks(page: Path) -> list[Block]:
 
 
 def link_samples(folder: Path) -> None:
-    """The samples in a folder, with the first seconds of the clip alone."""
+    """The samples in a folder, with a few frames of the clip alone."""
     for path in sorted((ROOT / "samples").rglob("*")):
         link = folder / path.relative_to(ROOT)
         if path.is_dir():
             link.mkdir(parents=True, exist_ok=True)
         elif path == CLIP:
-            copy_start(path, link, FRAMES)
+            write_excerpt(path, link)
         else:
             link.parent.mkdir(parents=True, exist_ok=True)
             link.symlink_to(path)
 
 
-def copy_start(source: Path, target: Path, frames: int) -> None:
-    """Copy the first frames of a clip, as they are coded."""
-    with av.open(str(source)) as read, av.open(str(target), "w") as written:
-        stream = written.add_stream_from_template(read.streams.video[0])
-        for number, packet in enumerate(read.demux(video=0)):
-            if number == frames or packet.dts is None:
-                break
-            packet.stream = stream
-            written.mux(packet)
+def write_excerpt(source: Path, target: Path) -> None:
+    """Write the frames of a clip in which the part is in view."""
+    clip = open_source(source, start=START, end=END)
+    with VideoSink(target, clip.width, clip.height, clip.fps) as sink:
+        for frame in clip:
+            sink.write(frame.image, frame.time_s)
 
 
 def runs(page: Path) -> bool:

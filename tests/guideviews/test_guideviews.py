@@ -442,13 +442,13 @@ def test_findings_name_the_block_a_problem_and_the_assembly_none() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("elevation_deg", [(10.0, 90.0), (55.0, 70.0)])
+@pytest.mark.parametrize("elevation_deg", [(50.0, 90.0), (55.0, 70.0)])
 def test_the_shares_do_not_depend_on_the_number_of_views(elevation_deg: tuple[float, float]) -> None:
     """`check` renders few views, `guideviews` many and a margin around the range: both state the same shares."""
     view_range = ViewRange((400.0, 700.0), elevation_deg=elevation_deg)
     few = assess(assessed_guide_views(assembly(), view_range))
     many = assess(make_guide_views(assembly(), view_range, GuideViewOptions(subdivisions=4, renderer="zbuffer")))
-    assert len(many.distinct_lines) > 3 * len(few.distinct_lines) >= 90
+    assert len(many.distinct_lines) > 3 * len(few.distinct_lines) >= 60
     assert (many.reason, many.score) == (few.reason, few.score)
 
 

@@ -25,7 +25,7 @@ def test_the_focal_length_of_a_film_is_estimated_and_kept(tmp_path: Path, monkey
         "--end",
         "200",
         "--stride",
-        "2",
+        "4",
     )
     result = CliRunner().invoke(main, ["annotate", str(sample / "clip.mp4"), *options, "--save-profile", "film"])
     assert result.exit_code == 0, result.output

@@ -32,13 +32,18 @@ PLACE = rigid(exp_so3(np.array([0.9, -1.4, 0.6])), [120.0, -300.0, 800.0])
 """scan_from_model."""
 
 
+def search_coarsely(patch: pytest.MonkeyPatch) -> None:
+    """A coarser search than usual, for time."""
+    for name, value in {"POINTS": 1500, "VOXELS": 28, "STEP_DEG": 8.0}.items():
+        patch.setattr(global_registration, name, value)
+    pairs = {"FIRST_PAIRS": 2000, "PAIRS": 3000, "ROUNDS": 2, "MODEL_POINTS": 1600, "KEPT": 10}
+    for name, value in pairs.items():
+        patch.setattr(pair_registration, name, value)
+
+
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A coarser search than usual, for time."""
-    for name, value in {"POINTS": 2000, "VOXELS": 28, "STEP_DEG": 8.0}.items():
-        monkeypatch.setattr(global_registration, name, value)
-    for name, value in {"FIRST_PAIRS": 4000, "PAIRS": 6000, "ROUNDS": 2}.items():
-        monkeypatch.setattr(pair_registration, name, value)
+    search_coarsely(monkeypatch)
 
 
 def scan(model: Model, place: Array = PLACE, count: int = 60_000, seed: int = 0, scale: float = 1.0) -> DenseCloud:
@@ -94,7 +99,7 @@ def test_clouds_of_nothing_that_is_known() -> None:
     with pytest.raises(InputError, match="20 points are too few"):
         find_model_in_cloud(DenseCloud(*(a[:20] for a in vars(cloud).values())), nominal())
     rng = np.random.default_rng(3)
-    ball = rng.normal(size=(20_000, 3))
+    ball = rng.normal(size=(8000, 3))
     ball = 90.0 * ball / np.linalg.norm(ball, axis=1, keepdims=True)
     other = replace(cloud, points=ball, normals=(ball / 90.0).astype(np.float32))
     with pytest.raises(InputError, match=r"cloud: the part (was not found|fits in two ways)"):
@@ -133,11 +138,12 @@ def inspected(tmp_path_factory: pytest.TempPathFactory) -> tuple[Inspection, Pat
     """What the command makes of a scan with a foreign block, NaN and repeats."""
     folder = tmp_path_factory.mktemp("scan")
     thing = Component("thing", *with_faces(box((-12, -20, 0), (8, -6, 12))))
-    cloud = scan(make_model("built", (*as_built().components, thing)), count=150_000)
+    cloud = scan(make_model("built", (*as_built().components, thing)), count=80_000)
     points = np.concatenate([cloud.points, cloud.points[:2000], np.full((50, 3), np.nan)])
     again = [np.concatenate([a, a[:2000], a[:50]]) for a in (cloud.normals, cloud.colors, cloud.sigma, cloud.views)]
     write_ply(DenseCloud(points, *again), folder / "scan.ply")
     with pytest.MonkeyPatch.context() as patch:
+        search_coarsely(patch)
         patch.setattr("arview.cad.load_part", lambda path, unit: plate_part())
         result = CliRunner().invoke(main, ["measure", "--cloud", str(folder / "scan.ply"), "--part", "part.toml"])
     assert result.exit_code == ExitCode.FAIL, result.output

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from measurement.test_cloud_alone import PLACE, off_mm, scan
+from measurement.test_cloud_alone import PLACE, off_mm, scan, search_coarsely
 
 from arview.geometry import Array, apply, invert, rigid
 from arview.measurement.cloud.pair_registration import find_by_pairs
@@ -25,13 +25,15 @@ def table() -> Array:
 
 
 @pytest.mark.slow
-def test_on_a_table_without_normals() -> None:
+def test_on_a_table_without_normals(monkeypatch: pytest.MonkeyPatch) -> None:
+    search_coarsely(monkeypatch)
     points = np.concatenate([scan(as_built(), count=40_000).points, table()])
     assert off_mm(find_by_pairs(points, None, nominal()).model_from_scan) < 0.3
 
 
 @pytest.mark.slow
-def test_a_half_with_normals_inward() -> None:
+def test_a_half_with_normals_inward(monkeypatch: pytest.MonkeyPatch) -> None:
+    search_coarsely(monkeypatch)
     cloud = scan(as_built(), count=40_000)
     seen = apply(invert(PLACE), cloud.points)[:, 0] > 0.0
     found = find_by_pairs(cloud.points[seen], -cloud.normals[seen].astype(np.float64), nominal())

@@ -17,7 +17,7 @@ EXPECTED_MM = 0.016
 """0.04 px at 0.4 mm per pixel."""
 
 
-def rim(rng: np.random.Generator, sigma_mm: float, arc: float = 2 * np.pi, count: int = 1200) -> DatumEquations:
+def rim(rng: np.random.Generator, sigma_mm: float, arc: float = 2 * np.pi, count: int = 400) -> DatumEquations:
     """Offsets of a rim at its nominal place whose edge deviates by smooth random errors of every harmonic."""
     angles = np.sort(rng.uniform(0, arc, count))
     radial = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(count)])

@@ -74,8 +74,8 @@ class Scene:
         """Shares of the part: covered by the occluder, of that not found, and found beside it."""
         finder = OccluderFinder(self.model, self.camera)
         covered = missed = total = lost = 0
-        for frame in range(60):
-            picture, occluder = self.picture(frame, hand if frame >= 30 else None)
+        for frame in range(44):
+            picture, occluder = self.picture(frame, hand if frame >= 28 else None)
             view = self.ghost.view(self.place(frame))
             assert view is not None
             found = finder.find(picture, view, self.place(frame), True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 
 import cv2
@@ -21,7 +22,7 @@ from arview.reconstruction.still import still_features, still_remark
 from arview.reconstruction.types import Photo, SparseModel
 from helpers.photo_scene import CAMERA, Picture, bench, photograph, ring, write_photos
 
-OPTIONS = SparseOptions(features=FeatureOptions(max_features=2500), first_features=1500, threads=2)
+OPTIONS = SparseOptions(features=FeatureOptions(max_features=2000), first_features=1500, threads=2)
 POSES = ring(16, 420.0, (40.0,))
 """The part turns by 22.5° between two photos: what the camera on its stand sees of it."""
 
@@ -41,6 +42,7 @@ def still_wall(seed: int = 3) -> np.ndarray:
     return wall
 
 
+@cache
 def turntable(count: int = len(POSES)) -> tuple[list[Picture], list[np.ndarray]]:
     """Photos of the turning part before the wall, with new noise in each, and where the part is in them."""
     wall, rng = still_wall(), np.random.default_rng(8)

@@ -163,7 +163,7 @@ def test_a_part_half_hidden_that_turns_in_jerks_is_followed_better_with_it() -> 
     """The part turns by 8° to 14° and moves by 20 mm per frame in random directions, which no prediction follows."""
     rng = np.random.default_rng(11)
     poses = [pose_from(rng.uniform(-20, 20), rng.uniform(40, 55), 600)]
-    while len(poses) < 40:
+    while len(poses) < 28:
         turned = wrong(poses[-1], rng, rng.uniform(8.0, 14.0), 20.0)
         eye = -turned[:3, :3].T @ turned[:3, 3]
         elevation_deg = np.rad2deg(np.arcsin(eye[2] / np.linalg.norm(eye)))
@@ -172,8 +172,8 @@ def test_a_part_half_hidden_that_turns_in_jerks_is_followed_better_with_it() -> 
     right = {}
     for name, chosen in (("without", None), ("with", recheck())):
         right[name] = sum(deg < 5.0 and mm < 50.0 for mm, _, deg in follow(poses, chosen, 10.0, is_hidden=True))
-    assert right["with"] >= 20
-    assert right["with"] >= right["without"] + 8
+    assert right["with"] >= 14
+    assert right["with"] >= right["without"] + 6
 
 
 def test_motion_distance_is_one_at_45_degrees_and_grows_with_the_square() -> None:

@@ -213,7 +213,7 @@ def test_quality_separates_right_from_wrong_poses() -> None:
     rng = np.random.default_rng(5)
     tracker = Tracker(assembly_views(), CAMERA, options=TrackerOptions(use_texture=False))
     right, mistaken, found = [], [], 0
-    for k in range(40):
+    for k in range(24):
         truth = pose_from(
             rng.uniform(-75, 75), rng.uniform(20, 70), rng.uniform(440, 620), roll_deg=rng.uniform(-18, 18)
         )
@@ -236,9 +236,9 @@ def test_quality_separates_right_from_wrong_poses() -> None:
                 mistaken.append(refiner.evidence(image, gray, pose, appearance).quality)
                 mm, _, deg = error(tracker.track(image).cam_from_model, truth)
                 found += mm < 5.0 and deg < 1.0
-    assert len(right) >= 38
+    assert len(right) >= 23
     assert found >= 0.9 * len(mistaken)
-    assert len(mistaken) >= 50
+    assert len(mistaken) >= 30
     assert np.mean(np.array(right) > 0.5) >= 0.97
     assert np.mean(np.array(mistaken) < 0.5) >= 0.95
 

@@ -25,8 +25,8 @@ FISHEYE = Camera(1100, 800, 500.0, 501.0, 552.0, 398.0, lens=LensDistortion(Lens
 RATIONAL = Camera(
     1100, 800, 720.0, 722.0, 552.0, 398.0, lens=LensDistortion(LensModel.RATIONAL, (0.5, -0.1, 0.001, 0, 0, 0.8, 0.05))
 )
-SCENE = Camera(2200, 1600, 700.0, 700.0, 1100.0, 800.0)
-"""A pinhole camera that sees all that the lenses see of the part, with more pixels."""
+SCENE = Camera(1760, 1280, 560.0, 560.0, 880.0, 640.0)
+"""A pinhole camera that sees all that the lenses see of the part, with more pixels in the middle of the fisheye."""
 ASIDE_DEG = 32.0
 
 
@@ -56,7 +56,7 @@ def _scene_pixels(is_fisheye: bool) -> tuple[NDArray[np.float32], NDArray[np.flo
 def test_part_is_found_and_tracked_far_off_the_axis(camera: Camera) -> None:
     session = SpecimenTracking(assembly_views(), camera, assembly())
     assert session.frames.tracked_camera.lens is None
-    truths = poses(8)
+    truths = poses(6)
     tracked = 0
     for index, truth in enumerate(truths):
         found = session.process(through(camera, truth, index), index, index / 30)
@@ -68,7 +68,7 @@ def test_part_is_found_and_tracked_far_off_the_axis(camera: Camera) -> None:
         assert across_mm < 0.3
         assert distance_mm < 2.5
         assert angle_deg < 0.6
-    assert tracked >= 6
+    assert tracked >= 5
 
 
 @pytest.mark.slow
@@ -126,5 +126,5 @@ def test_pixels_and_sizes_of_frames() -> None:
         view.picture(np.zeros((10, 10, 3), dtype=np.uint8), 3)
     plain = FrameView(SCENE)
     assert plain.tracked_camera is SCENE
-    frame = np.zeros((1600, 2200, 3), dtype=np.uint8)
+    frame = np.zeros((SCENE.height, SCENE.width, 3), dtype=np.uint8)
     assert plain.picture(frame, 0) is frame

@@ -19,6 +19,7 @@ from arview.geometry import Array, rigid, rotation_angle_rad
 from arview.measurement.photo import edges, sweep
 from arview.reconstruction.dense import DenseOptions
 from arview.reconstruction.features import FeatureOptions
+from arview.reconstruction.memory import SparseMemory
 from arview.reconstruction.run import Reconstruction, ReconstructOptions, reconstruct
 from arview.reconstruction.sparse import SparseOptions
 from arview.workflow.job import InspectJob
@@ -33,7 +34,7 @@ STEP_PX = 40
 MOVED_MM = np.array([1.2, -0.8, 0.0])
 OPTIONS = ReconstructOptions(
     sparse=SparseOptions(features=FeatureOptions(max_features=2500), first_features=1500, threads=2),
-    dense=DenseOptions(max_region_px=120_000), last_stage="scale",
+    dense=DenseOptions(max_region_px=60_000), last_stage="scale",
 )  # fmt: skip
 
 
@@ -139,10 +140,11 @@ def test_masks_of_what_is_not_seen(tmp_path: Path) -> None:
 @pytest.mark.slow  # structure from motion of 12 photos, twice
 def test_a_part_before_a_moving_background_is_placed_by_itself(tmp_path: Path) -> None:
     photos, part = of_photos(tmp_path, STEP_PX)
+    memory = SparseMemory(tmp_path / "features")
     with pytest.raises(CannotMeasureError):
-        reconstruct(photos, tmp_path / "whole", part, "fov:47", OPTIONS)
+        reconstruct(photos, tmp_path / "whole", part, "fov:47", OPTIONS, memory=memory)
     options = replace(OPTIONS, silhouettes=CadSilhouettes(part))
-    found = reconstruct(photos, tmp_path / "auto", part, "fov:47", options)
+    found = reconstruct(photos, tmp_path / "auto", part, "fov:47", options, memory=memory)
     check_poses(found)
     assert np.mean(off_part_mm(found) < 3.0) > 0.95  # the rest are features on the outline, with wall beside it
     assert found.scale is not None and any("by the part alone" in one for one in found.scale.warnings)
@@ -164,10 +166,11 @@ def test_masks_do_not_change_what_is_measured(tmp_path: Path) -> None:
     from arview.measurement.run import measure
 
     photos, part = of_photos(tmp_path, 0)
-    options = replace(OPTIONS, last_stage="dense")
+    options, memory = replace(OPTIONS, last_stage="dense"), SparseMemory(tmp_path / "features")
     results = []
     for name, silhouettes in (("whole", None), ("auto", CadSilhouettes(part))):
-        one = reconstruct(photos, tmp_path / name, part, "fov:47", replace(options, silhouettes=silhouettes))
+        chosen = replace(options, silhouettes=silhouettes)
+        one = reconstruct(photos, tmp_path / name, part, "fov:47", chosen, memory=memory)
         check_poses(one)
         assert one.sparse is not None and one.scale is not None and one.cloud is not None
         measured = measure(MetricReconstruction(one.sparse, one.scale, one.cloud), part)

@@ -19,7 +19,7 @@ import pytest
 
 from arview.station.live.security.addresses import LOOPBACK, bind
 from arview.station.walk.job import JobFolder, jobs_in
-from helpers.live_client import Http, paired_cookie
+from helpers.live_client import Http, paired_cookie, wait
 from helpers.live_jobs import about, measured, photo
 from helpers.live_sample import PART
 
@@ -155,11 +155,21 @@ def test_everything_confirmed_is_there_after_the_program_was_killed(tmp_path: Pa
     program.kill(signal.SIGTERM)
 
 
-def decisions_survive(program: Program, job: JobFolder, cookie: str) -> None:
-    """Decisions that were confirmed are there after the program was killed."""
-    measured(job)
+def loaded(program: Program, cookie: str) -> Http:
+    """A page of the program, when the part is loaded."""
     page = Http(program.port, program.token)
     page.headers["Cookie"] = cookie
+    wait(lambda: page.json("GET", "/api/jobs")[0] != 503, 120.0)
+    return page
+
+
+def decisions_survive(program: Program, job: JobFolder, cookie: str) -> None:
+    """Decisions that were confirmed are there after the program was killed."""
+    program.kill(signal.SIGTERM)  # its workers end with it: one that still ran would write its own state
+    job.end()
+    measured(job)
+    program.start()
+    page = loaded(program, cookie)
     kept = []
     for number in range(3):
         decision = {"component": "post_1", "is_ok": True, "reason": f"reason {number}", "by": "Ada"}
@@ -168,12 +178,7 @@ def decisions_survive(program: Program, job: JobFolder, cookie: str) -> None:
         kept.append(answer["reason"])
     program.kill()
     program.start()
-    page = Http(program.port, program.token)
-    page.headers["Cookie"] = cookie
-    for _ in range(200):
-        status, told = page.json("GET", f"/api/jobs/{job.id}")
-        if status != 503:
-            break
-        time.sleep(0.1)
+    status, told = loaded(program, cookie).json("GET", f"/api/jobs/{job.id}")
+    assert status == 200, told
     assert [one["reason"] for one in told["decisions"]] == kept == ["reason 0", "reason 1", "reason 2"]
     assert told["record"]["faults"] == []

@@ -33,6 +33,7 @@ from helpers.live_sample import (
     there_and_back,
     truth,
 )
+from helpers.told_station import told_loader
 
 
 def send(page: Http, name: str, index: int, **headers: str) -> tuple[int, dict[str, str], bytes]:
@@ -360,7 +361,7 @@ def test_silent_pages_leave_by_themselves(monkeypatch: pytest.MonkeyPatch) -> No
 def test_every_phone_is_recorded_from_its_first_picture(tmp_path: Path) -> None:
     (tmp_path / "out-2.mp4").write_bytes(b"of another day")
     chosen = options(record=tmp_path / "out.mp4", record_folder=tmp_path, max_age_s=None)
-    with running(chosen, loader(chosen)) as server:
+    with running(chosen, told_loader(chosen)) as server:
         pages = [server.session(), server.session()]
         names = [page.join() for page in pages]
         for index in range(3):

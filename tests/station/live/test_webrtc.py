@@ -23,6 +23,7 @@ from arview.station.live.transport.receiving import (
 from arview.station.live.transport.webrtc import MAX_CANDIDATES, _checked_offer, _with_bitrates
 from helpers.live_client import Camera, Phone, Running, running
 from helpers.live_sample import HEIGHT, WIDTH, errors, frames, loader, nearest, options, there_and_back, truth
+from helpers.told_station import told_loader
 
 pytestmark = pytest.mark.slow  # phones that connect and stream
 
@@ -33,6 +34,14 @@ FPS = 15.0
 def phones() -> Iterator[Running]:
     chosen = options(max_age_s=None, clients=3)
     with running(chosen, loader(chosen)) as server:
+        yield server
+
+
+@pytest.fixture(scope="module")
+def told_phones() -> Iterator[Running]:
+    """Its sessions recognise the frames: for tests of what carries them."""
+    chosen = options(max_age_s=None, clients=3)
+    with running(chosen, told_loader(chosen)) as server:
         yield server
 
 
@@ -73,9 +82,9 @@ def test_poses_are_those_of_the_very_frame_and_come_soon(phones: Running) -> Non
     assert not phone.shown  # poses only: no picture comes back to a phone
 
 
-def test_annotated_video_comes_back_with_the_ids_of_its_frames(phones: Running) -> None:
+def test_annotated_video_comes_back_with_the_ids_of_its_frames(told_phones: Running) -> None:
     async def go() -> Phone:
-        async with Phone(phones.session(), camera(), mode="video") as phone:
+        async with Phone(told_phones.session(), camera(), mode="video") as phone:
             await phone.until(lambda: len(phone.shown) >= 28 and phone.answers, 60)
             # Back to poses: the pictures stop.
             await asyncio.to_thread(phone.http.json, "POST", f"/api/clients/{phone.name}/control", {"mode": "poses"})
@@ -116,7 +125,7 @@ def test_station_sends_its_plain_picture_with_ids_and_poses(tmp_path_factory: py
             )
             return one, two
 
-    with running(chosen, loader(chosen)) as server:
+    with running(chosen, told_loader(chosen)) as server:
         one, two = asyncio.run(go(server))
     answered = {answer["id"] for _, answer in one.answers}
     shown = [frame_id for _, frame_id in one.shown[5:] if frame_id is not None]
@@ -157,11 +166,11 @@ def test_frames_that_arrive_scaled_keep_their_poses_and_are_told(phones: Running
     assert np.median(off) < 2.0
 
 
-def test_a_page_that_hides_its_addresses_is_reached_all_the_same(phones: Running) -> None:
+def test_a_page_that_hides_its_addresses_is_reached_all_the_same(told_phones: Running) -> None:
     """Browsers replace their addresses by multicast DNS names, which the server does not resolve."""
 
     async def go() -> Phone:
-        phone = Phone(phones.session(), camera())
+        phone = Phone(told_phones.session(), camera())
         hidden = re.compile(r"(a=candidate:\S+ \d udp \d+ )\S+( .*)")
         phone.change_offer = lambda sdp: hidden.sub(r"\g<1>1f4712db-ea17-4bcf-a596-105139dfd8bf.local\2", sdp)
         async with phone:
@@ -171,9 +180,9 @@ def test_a_page_that_hides_its_addresses_is_reached_all_the_same(phones: Running
     assert asyncio.run(go()).answers
 
 
-def test_a_second_phone_has_its_own_session(phones: Running) -> None:
+def test_a_second_phone_has_its_own_session(told_phones: Running) -> None:
     async def go() -> tuple[Phone, Phone]:
-        async with Phone(phones.session(), camera()) as one, Phone(phones.session(), camera(500)) as two:
+        async with Phone(told_phones.session(), camera()) as one, Phone(told_phones.session(), camera(500)) as two:
             await one.until(lambda: one.states().count("tracked") > 5 and two.states().count("tracked") > 5, 60)
             return one, two
 
@@ -199,22 +208,22 @@ OFFERS = {
 
 
 @pytest.mark.parametrize("sdp", OFFERS.values(), ids=OFFERS.keys())
-def test_malformed_offers_are_refused_and_leave_nothing(phones: Running, sdp: str) -> None:
-    page = phones.session()
-    before = set(phones.hub.clients)
+def test_malformed_offers_are_refused_and_leave_nothing(told_phones: Running, sdp: str) -> None:
+    page = told_phones.session()
+    before = set(told_phones.hub.clients)
     offer = {"type": "offer", "sdp": sdp}
     status, refused = page.json("POST", "/api/clients", {"transport": "webrtc", "mode": "poses", "offer": offer})
     assert (status, refused["error"]) == (400, "bad_offer") and len(refused["message"]) < 120
-    assert set(phones.hub.clients) == before
+    assert set(told_phones.hub.clients) == before
     for wrong in ({"transport": "webrtc"}, {"transport": "webrtc", "offer": 3}, {"transport": "webrtc", "offer": {}}):
         assert page.json("POST", "/api/clients", wrong)[1]["error"] == "bad_offer"
 
 
-def test_damaged_offers(phones: Running) -> None:
+def test_damaged_offers(told_phones: Running) -> None:
     """Valid offers with bytes changed, removed or duplicated: refused, or never connected."""
 
     async def offer() -> str:
-        phone = Phone(phones.session(), camera())
+        phone = Phone(told_phones.session(), camera())
         await phone.__aenter__()
         sdp = str(phone._peer.localDescription.sdp)
         await phone.__aexit__()
@@ -222,7 +231,7 @@ def test_damaged_offers(phones: Running) -> None:
 
     good = "".join(line for line in asyncio.run(offer()).splitlines(True) if not line.startswith("a=candidate"))
     rng = np.random.default_rng(0)
-    page = phones.session()
+    page = told_phones.session()
     answers = []
     for trial in range(21):
         text = bytearray(good.encode())
@@ -238,17 +247,17 @@ def test_damaged_offers(phones: Running) -> None:
         if status == 201:
             assert page.ask("DELETE", f"/api/clients/{answer['client']}")[0] == 204
     assert 400 in answers and page.json("GET", "/api/status")[0] == 200
-    assert not phones.hub.clients
+    assert not told_phones.hub.clients
 
 
 def test_clients_that_vanish_again_and_again_leave_nothing_behind(
-    phones: Running, monkeypatch: pytest.MonkeyPatch
+    told_phones: Running, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Pages that are closed, and pages whose network fails, which only missing consent reveals (RFC 7675)."""
     monkeypatch.setattr(aioice.ice, "CONSENT_INTERVAL", 0.1)
 
     async def one(is_cut: bool) -> None:
-        phone = Phone(phones.session(), camera())
+        phone = Phone(told_phones.session(), camera())
         await phone.__aenter__()
         await phone.until(lambda: phone.answers, 30)
         if is_cut:
@@ -258,10 +267,10 @@ def test_clients_that_vanish_again_and_again_leave_nothing_behind(
         else:
             await phone.vanish()
         for _ in range(1200):
-            if not phones.hub.clients:
+            if not told_phones.hub.clients:
                 break
             await asyncio.sleep(0.05)
-        assert not phones.hub.clients
+        assert not told_phones.hub.clients
         if is_cut:
             await asyncio.wait_for(phone.vanish(), 10)
 
@@ -275,7 +284,7 @@ def test_clients_that_vanish_again_and_again_leave_nothing_behind(
     asyncio.run(go(4))
     gc.collect()
     assert threading.active_count() <= threads + 2
-    assert phones.session().json("GET", "/api/status")[1]["clients"] == 0
+    assert told_phones.session().json("GET", "/api/status")[1]["clients"] == 0
 
 
 def test_an_offer_without_a_page_behind_it_is_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -293,17 +302,17 @@ def test_an_offer_without_a_page_behind_it_is_forgotten(monkeypatch: pytest.Monk
         connecting.cancel()
         await phone._peer.close()
 
-    with running(chosen, loader(chosen)) as server:
+    with running(chosen, told_loader(chosen)) as server:
         asyncio.run(go(server))
 
 
-def test_a_slow_screen_gets_fewer_pictures_not_later_ones(phones: Running) -> None:
+def test_a_slow_screen_gets_fewer_pictures_not_later_ones(told_phones: Running) -> None:
     """A screen that takes 3 pictures per second does not slow down another, and nothing queues up."""
 
     async def go() -> tuple[Phone, Phone]:
         async with (
-            Phone(phones.session(), camera(), mode="video", pause_s=0.3) as slow,
-            Phone(phones.session(), camera(), mode="poses") as quick,
+            Phone(told_phones.session(), camera(), mode="video", pause_s=0.3) as slow,
+            Phone(told_phones.session(), camera(), mode="poses") as quick,
         ):
             await quick.until(lambda: quick.states().count("tracked") > 30 and slow.shown, 60)
             return slow, quick

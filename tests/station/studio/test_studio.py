@@ -32,9 +32,18 @@ def studio(tmp_path: Path) -> Iterator[Studio]:
         yield running
 
 
-def test_without_the_token_nothing_is_served(tmp_path: Path, studio: Studio) -> None:
-    assert Http(studio.server.port, "guessed").ask("GET", "/api/part")[0] == 403
-    assert studio.http.ask("GET", "/api/part")[0] == 200
+@pytest.fixture(scope="module")
+def unchanged(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Studio]:
+    """A studio for tests that change nothing."""
+    folder = tmp_path_factory.mktemp("unchanged")
+    (folder / "bracket.step").write_bytes((SAMPLE / "bracket_plate.step").read_bytes())
+    with running_studio(folder / "bracket.step") as running:
+        yield running
+
+
+def test_without_the_token_nothing_is_served(unchanged: Studio) -> None:
+    assert Http(unchanged.server.port, "guessed").ask("GET", "/api/part")[0] == 403
+    assert unchanged.http.ask("GET", "/api/part")[0] == 200
 
 
 def test_a_bare_cad_file_becomes_a_part_file(tmp_path: Path, studio: Studio) -> None:
@@ -92,19 +101,19 @@ def test_a_click_on_a_hole_and_the_top_makes_datums(tmp_path: Path, studio: Stud
     ],
 )
 def test_an_edit_that_would_break_the_file_changes_nothing(
-    studio: Studio, change: dict[str, object], message: str
+    unchanged: Studio, change: dict[str, object], message: str
 ) -> None:
-    before = studio.get("/api/part")
-    answer = studio.edit(422, **change)
+    before = unchanged.get("/api/part")
+    answer = unchanged.edit(422, **change)
     assert message in answer["message"] and "\n" not in answer["message"]
-    assert studio.get("/api/part") == before
+    assert unchanged.get("/api/part") == before
 
 
-def test_the_mesh_holds_every_component_with_its_faces(studio: Studio) -> None:
-    content = studio.get("/api/mesh")
+def test_the_mesh_holds_every_component_with_its_faces(unchanged: Studio) -> None:
+    content = unchanged.get("/api/mesh")
     (length,) = struct.unpack_from("<I", content)
     header = json.loads(content[4 : 4 + length])
-    model = studio.document.cad
+    model = unchanged.document.cad
     assert [count for _, count in header["ranges"]] == [len(component.faces) for component in model.components]
     points = np.frombuffer(content, np.float32, 3 * header["vertices"], 4 + length).reshape(-1, 3)
     corners = np.frombuffer(content, np.uint32, 3 * header["faces"], 4 + length + points.nbytes).reshape(-1, 3)

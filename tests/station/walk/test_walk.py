@@ -159,7 +159,7 @@ def test_a_killed_worker_continues_to_the_same_numbers(measured: JobFolder, stat
         add(job, picture, pose)
     job.end()
     killed = []
-    for step in ("matching", "finding the part", "components"):
+    for step in ("matching", "components"):
         with start_worker(job) as worker:
             ends = time.monotonic() + 300.0
             while job.state().step != step and worker.poll() is None and time.monotonic() < ends:

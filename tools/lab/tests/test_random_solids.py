@@ -12,7 +12,8 @@ from scipy.spatial import cKDTree
 from arview.cad import Model
 from arview_lab.semisynthetic.random_solids import random_near_symmetric, random_solid
 
-SEEDS = range(30)
+SEEDS = (*range(14), 23)
+"""Of the last one all tries to make it nearly symmetric fail."""
 
 
 @cache
@@ -30,7 +31,7 @@ def near_symmetric(seed: int) -> Model | None:
 def test_a_solid_consists_of_closed_bodies_of_a_parts_size(made: Callable[[int], Model | None], seed: int) -> None:
     solid = made(seed)
     if solid is None:
-        assert made is near_symmetric and seed in (21, 23)
+        assert made is near_symmetric and seed == 23
         return
     assert 60.0 < solid.diameter_mm < 350.0
     for component in solid.components:
@@ -68,4 +69,4 @@ def test_a_near_symmetric_solid_is_symmetric_but_for_a_few_features() -> None:
         shares = np.array([[np.mean(one < limit) for limit in (most_deep, 0.01)] for one in away_mm])
         assert shares[:, 0].max() > 0.6 and shares[:, 1].max() < 1.0, (seed, shares)
         seen += 1
-    assert seen > 25
+    assert seen == len(SEEDS) - 1

@@ -31,8 +31,8 @@ def minima_study(is_quick: bool = False, seed: int = 0) -> Study:
     The posts are round, hexagonal, stepped (two diameters) and grooved (a groove every 4 mm, so that the cost has a
     minimum each time its grooves meet others).
     """
-    runs, count = (2, 1500) if is_quick else (12, COUNT)
-    lengths = LENGTHS_MM[::2] if is_quick else LENGTHS_MM
+    runs, count = (2, 1000) if is_quick else (12, COUNT)
+    lengths = LENGTHS_MM[::4] if is_quick else LENGTHS_MM
     rows: list[tuple[object, ...]] = []
     curves: list[tuple[object, ...]] = []
     summary, pictures = [], []

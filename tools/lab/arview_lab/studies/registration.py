@@ -60,7 +60,7 @@ def registration_study(is_quick: bool = False, seed: int = 0, runs: int | None =
         seed: of the samples.
         runs: default 50.
     """
-    runs, count = (3, 3000) if is_quick else (runs or 50, COUNT)
+    runs, count = (2, 2000) if is_quick else (runs or 50, COUNT)
     surface, center = post()
     rows: list[tuple[object, ...]] = []
     summary = []
