@@ -75,7 +75,10 @@ def epipolar_inliers(ones: Features, others: Features, matches: Matches, max_err
     points = ones.points_px[matches[:, 0]].astype(np.float64)
     partners = others.points_px[matches[:, 1]].astype(np.float64)
     # OpenCV's USAC has a fixed seed, so the same matches give the same inliers.
-    matrix, mask = cv2.findFundamentalMat(points, partners, cv2.USAC_MAGSAC, max_error_px, 0.999, 5000)
+    try:
+        matrix, mask = cv2.findFundamentalMat(points, partners, cv2.USAC_MAGSAC, max_error_px, 0.999, 5000)
+    except cv2.error:  # OpenCV 5 raises where none of its samples gave a matrix
+        return matches[:0]
     if matrix is None or mask is None:
         return matches[:0]
     return matches[mask.ravel() > 0]
