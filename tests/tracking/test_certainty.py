@@ -53,7 +53,10 @@ def test_what_speaks_against_a_pose_lowers_its_quality(worse: dict[str, float]) 
 
 def test_errors_that_all_points_share_are_a_shift_across_and_a_change_of_size_along() -> None:
     pose = pose_from(30.0, 40.0, 600.0)
-    covariance = common_covariance(pose, radius_px=100.0, diameter_mm=200.0)
+    covariance = common_covariance(pose, 100.0, 200.0, np.zeros(6))
     in_camera = pose[:3, :3] @ covariance[3:, 3:] @ pose[:3, :3].T
     assert np.sqrt(np.diag(in_camera)) == pytest.approx([0.6, 0.6, 0.003 * pose[2, 3]], rel=1e-6)
     assert np.sqrt(np.diag(covariance)[:3]) == pytest.approx([0.003] * 3)
+    moved = common_covariance(pose, 100.0, 200.0, np.array([0.0, 0.0, 0.0, 20.0, 0.0, 0.0]))
+    assert np.all(np.linalg.eigvalsh(moved - covariance) > -1e-12)
+    assert 1.0 < np.sqrt(np.trace(moved[3:, 3:]) / np.trace(covariance[3:, 3:])) < 3.0

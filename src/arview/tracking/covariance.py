@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from arview.geometry import Array
@@ -11,6 +13,8 @@ CORRELATED_POINTS = 8.0
 COMMON_SHIFT_PX, COMMON_SIZE_PX = 0.6, 0.3
 """Standard deviations of what all points share: a shift, and a change of the part's radius or its turn. Errors of lens,
 CAD and light do not average out."""
+MOTION_SHIFT, MOTION_SIZE = 0.1, 0.05
+"""Shares of the motion since the last frame by which they grow: blur and rolling shutter move all points alike."""
 
 
 def covariance_of(information: Array, quality: float, diameter_mm: float) -> Array:
@@ -25,12 +29,23 @@ def covariance_of(information: Array, quality: float, diameter_mm: float) -> Arr
     return np.asarray(covariance, dtype=np.float64)
 
 
-def common_covariance(cam_from_body: Array, radius_px: float, diameter_mm: float) -> Array:
-    """Covariance (6,6) of the errors that all points of a frame share, at a pose (4,4) of a part of some radius."""
-    across_mm = COMMON_SHIFT_PX / radius_px * 0.5 * diameter_mm
-    along_mm = COMMON_SIZE_PX / radius_px * max(float(cam_from_body[2, 3]), 0.0)
+def common_covariance(cam_from_body: Array, radius_px: float, diameter_mm: float, motion: Array) -> Array:
+    """Covariance (6,6) of the errors that all points of a frame share.
+
+    Args:
+        cam_from_body: (4,4) pose.
+        radius_px: half the diameter of the part in the picture.
+        diameter_mm: of the part.
+        motion: (6,) twist (rad, mm) of the part since the last frame.
+    """
+    distance_mm, mm_per_px = max(float(cam_from_body[2, 3]), 1.0), 0.5 * diameter_mm / radius_px
+    shift_mm = cam_from_body[:3, :3] @ motion[3:]
+    turned_px = radius_px * float(np.linalg.norm([*motion[:3], shift_mm[2] / distance_mm]))
+    motion_px = math.hypot(turned_px, *(shift_mm[:2] / mm_per_px))
+    shift_px = math.hypot(COMMON_SHIFT_PX, MOTION_SHIFT * motion_px)
+    turn_rad = math.hypot(COMMON_SIZE_PX, MOTION_SIZE * motion_px) / radius_px
     covariance = np.zeros((6, 6))
-    covariance[:3, :3] = (COMMON_SIZE_PX / radius_px) ** 2 * np.eye(3)
-    axes = np.diag(np.square([across_mm, across_mm, along_mm]))
+    covariance[:3, :3] = turn_rad**2 * np.eye(3)
+    axes = np.diag(np.square([shift_px * mm_per_px, shift_px * mm_per_px, turn_rad * distance_mm]))
     covariance[3:, 3:] = cam_from_body[:3, :3].T @ axes @ cam_from_body[:3, :3]
     return covariance

@@ -484,4 +484,5 @@ class Tracker:
         """
         cam_from_body = estimate.cam_from_model @ self.refiner.part.model_from_body
         own = covariance_of(estimate.information / CAUTION, estimate.quality, self.diameter_mm)
-        return own + common_covariance(cam_from_body, self.refiner.radius_px(cam_from_body), self.diameter_mm)
+        radius_px, motion = self.refiner.radius_px(cam_from_body), self.state.velocity / VELOCITY_DECAY
+        return own + common_covariance(cam_from_body, radius_px, self.diameter_mm, motion)
