@@ -34,6 +34,8 @@ COLOUR_GAP_PX = 7
 and what is seen through it are one."""
 TRACKING = Subjects.session
 """The session that tracks."""
+FREEZES = 6
+"""Frames that may be frozen before one with an overlay is."""
 MEDIAN_PX, MAX_PX = 1.5, 4.0
 """Of the ghost's outline; of the part itself nothing may be further off in nineteen of twenty places."""
 
@@ -98,16 +100,23 @@ def choose(page: Any, transport: str, link: str, mode: str) -> None:
 
 
 def freeze(page: Any) -> int:
-    """Freeze a frame with an overlay; returns the number that the film shows in it."""
-    until(page, "window.drawn?.pose?.state === 'tracked' && window.drawn.pose.cam_from_model !== null")
-    page.keyboard.press(" ")
-    until(page, "document.body.dataset.state === 'frozen'")
-    page.wait_for_timeout(300)
-    picture = screenshot(page)
-    number = number_in(picture, picture.shape[1] / WIDTH)
-    assert number is not None
-    assert page.evaluate("window.drawn.pose !== null"), "frozen without a ghost"
-    return number
+    """Freeze a frame with an overlay; returns the number that the film shows in it.
+
+    A frame that was dropped on the way has none, as on a slow machine: then the next one is frozen.
+    """
+    for _ in range(FREEZES):
+        until(page, "window.drawn?.pose?.state === 'tracked' && window.drawn.pose.cam_from_model !== null")
+        page.keyboard.press(" ")
+        until(page, "document.body.dataset.state === 'frozen'")
+        page.wait_for_timeout(300)
+        if page.evaluate("window.drawn.pose !== null"):
+            picture = screenshot(page)
+            number = number_in(picture, picture.shape[1] / WIDTH)
+            assert number is not None
+            return number
+        page.keyboard.press(" ")
+        until(page, "document.body.dataset.state !== 'frozen'")
+    raise AssertionError(f"{FREEZES} times frozen without a ghost")
 
 
 def nearest_frame(found: np.ndarray, number: int, gap_px: int = 1) -> int:
