@@ -187,7 +187,10 @@ def squared_distances(tracker: Tracker, estimates: list[Estimate], truths: list[
 def test_covariance_covers_the_errors_of_a_real_camera() -> None:
     images = [picture(p, camera=REAL_CAMERA, seed=i, noise=4.0, scene=2) for i, p in enumerate(PATH)]
     tracker, estimates, _ = follow(images, PATH)
-    assert 0.2 < np.median(squared_distances(tracker, estimates, PATH[1:])) < 5.0
+    distances = squared_distances(tracker, estimates, PATH[1:])
+    # Cautious: blur and rolling shutter, for which the motion counts, are not in these pictures.
+    assert 0.03 < np.median(distances) < 2.0
+    assert np.mean(distances < 12.6 / 6.0) >= 0.95
 
 
 @pytest.mark.slow
@@ -204,7 +207,8 @@ def test_covariance_is_never_too_small_on_ideal_pictures_and_grows_with_hiding()
     hidden = [picture(p, seed=i, card=half_hidden(p) if i >= 10 else None) for i, p in enumerate(PATH)]
     other, poorer, _ = follow(hidden, PATH)
     sure, unsure = tracker.covariance(estimates[20]), other.covariance(poorer[20])
-    assert np.linalg.det(unsure[3:, 3:]) > 2.0 * np.linalg.det(sure[3:, 3:])
+    # What all points of a frame share is the same; what each measures for itself is less.
+    assert np.linalg.det(unsure[3:, 3:]) > 1.5 * np.linalg.det(sure[3:, 3:])
 
 
 @pytest.mark.slow
