@@ -169,6 +169,12 @@ def look_at(camera_in_model: ArrayLike, target_in_model: ArrayLike, up_in_model:
     return rigid(rotation, -rotation @ eye)
 
 
+def direction_from(cam_from_model: Array, center_in_model: Array) -> Array:
+    """Unit vector (3,), in the model frame, from a part's centre (3,) towards the camera at a pose (4,4)."""
+    offset = -cam_from_model[:3, :3].T @ cam_from_model[:3, 3] - center_in_model
+    return np.asarray(offset / np.linalg.norm(offset), dtype=np.float64)
+
+
 def check_rigid(matrix: ArrayLike, name: str) -> Array:
     """Return the (4,4) matrix as float64 after checking that it is a finite rigid transform.
 

@@ -103,7 +103,8 @@ class Pose:
         cam_from_model: (4,4) OpenCV camera from model, mm; None while searching or lost.
         covariance: (6,6) of the twist (rotation rad, translation mm) applied on the right of
             ``cam_from_model`` about the model's centre; None without a pose.
-        quality: 0–1; right poses mostly exceed 0.5, wrong ones mostly do not.
+        quality: 0–1, probability that the pose is right within 5 cm, 5° and a tenth of the part's diameter; 0 without
+            a pose.
         state: see `TrackingState`.
         time_s: time stamp of the frame.
         index: index of the frame in its source.

@@ -16,11 +16,11 @@ from arview.station.live.server import clients
 from arview.station.live.stream import documents
 from arview.station.live.stream.subjects import Subjects
 from helpers import live_browser
-from helpers.inspection_loop import Stop, WalkSession
 from helpers.live_client import Running, running
 from helpers.live_sample import INSPECTION, loader, options
 from helpers.page import WATCH, opened, until
 from helpers.told_jobs import CELLS, ToldJobs
+from helpers.told_session import numbered_session
 
 WIDTH, HEIGHT, FPS = 640, 360, 5
 PHONE = {"width": 390, "height": 844}
@@ -61,13 +61,9 @@ def server() -> Iterator[Running]:
     def told(*of: Any, **more: Any) -> dict[str, Any]:
         return {**plain(*of, **more), **({"capture": dict(ADVICE)} if ADVICE else {})}
 
-    def session(subjects: Subjects, camera: Any) -> WalkSession:
-        return WalkSession(places, [one.name for one in subjects[0].part.model.components], camera)
-
-    places = [Stop(b"", pose) for pose in live_browser.truth()]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(clients, "pose_document", told)
-        patch.setattr(Subjects, "session", session)
+        patch.setattr(Subjects, "session", numbered_session)
         chosen = options(inspection=None, clients=4)
         with running(chosen, loader(chosen)) as one:
             yield one

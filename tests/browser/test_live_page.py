@@ -21,12 +21,11 @@ from arview.station.live.stream.stamp import Stamp, stamp_strip
 from arview.station.live.stream.subjects import Subjects
 from arview.video import VideoSink
 from helpers import live_browser
-from helpers.inspection_loop import Stop, WalkSession
 from helpers.live_browser import closed, difference_mask, number_in, outline_errors_px, screenshot, true_mask
 from helpers.live_client import Running, running
 from helpers.live_sample import INSPECTION, loader, options
 from helpers.page import WATCH, opened, until
-from helpers.told_session import TOLD, Told
+from helpers.told_session import TOLD, Told, numbered_session
 
 WIDTH, HEIGHT, FPS = 640, 360, 5
 COLOUR_GAP_PX = 7
@@ -43,11 +42,9 @@ MEDIAN_PX, MAX_PX = 1.5, 4.0
 @pytest.fixture(scope="module", autouse=True)
 def told_sessions() -> Iterator[None]:
     """Sessions say what the tests want; the ghost of what they do not verify would be too faint to be measured."""
-    places = [Stop(b"", pose) for pose in live_browser.truth()]
 
     def session(subjects: Subjects, camera: Camera) -> Any:
-        names = [one.name for one in subjects[0].part.model.components]
-        return Told(WalkSession(places, names, camera), names)
+        return Told(numbered_session(subjects, camera), [one.name for one in subjects[0].part.model.components])
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Subjects, "session", session)

@@ -6,6 +6,9 @@ from dataclasses import replace
 from typing import Any
 
 from arview.pose import ComponentPresence, Pose, Presence, Visibility
+from arview.station.live.stream.subjects import Subjects
+from helpers import live_browser
+from helpers.inspection_loop import Stop, WalkSession
 
 
 class Told:
@@ -28,3 +31,9 @@ class Told:
 
 TOLD: dict[str, dict[str, Any]] = {"components": {}, "more": {}}
 """What all sessions say: of components that are not present, and more fields of the pose."""
+
+
+def numbered_session(subjects: Subjects, camera: Any) -> WalkSession:
+    """A session that reads the place of the camera from the number in the film of `live_browser`."""
+    names = [one.name for one in subjects[0].part.model.components]
+    return WalkSession([Stop(b"", pose) for pose in live_browser.truth()], names, camera)

@@ -17,6 +17,7 @@ from unittest.mock import patch
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
+from scipy.special import expit
 from scipy.stats import chi2
 
 from arview.core.atomic import replacing
@@ -154,7 +155,7 @@ def _fitted(found: Sequence[TrackedPoses]) -> Array:
     def loss(weights: Array) -> tuple[float, Array]:
         logits = rows @ weights
         value = float(weight @ (np.logaddexp(0.0, logits) - right * logits) + penalty @ weights**2)
-        return value, rows.T @ (weight * (1.0 / (1.0 + np.exp(-logits)) - right)) + 2.0 * penalty * weights
+        return value, rows.T @ (weight * (expit(logits) - right)) + 2.0 * penalty * weights
 
     bounds = [(0.0, None) if sign > 0 else (None, 0.0) for sign in SIGNS]
     start = np.zeros(rows.shape[1])
@@ -166,7 +167,7 @@ def _report(found: Sequence[TrackedPoses]) -> list[str]:
     quality = []
     for one in found:
         weights = _fitted([other for other in found if other is not one])
-        quality.append(1.0 / (1.0 + np.exp(-(one.features @ weights[:-1] + weights[-1]))))
+        quality.append(expit(one.features @ weights[:-1] + weights[-1]))
     joined, right = np.concatenate(quality), np.concatenate([one.is_right for one in found])
     lines = ["quality      poses  mean   right"]
     for low, high in pairwise(BINS):

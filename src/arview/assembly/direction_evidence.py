@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.geometry import Array
+from arview.geometry import Array, direction_from
 
 NEW_DIRECTION_DEG = 6.0
 """Directions this far from all others are new."""
@@ -110,8 +110,7 @@ class DirectionEvidence:
 
     def _direction(self, cam_from_model: Array) -> Array:
         """(3,) unit vector from the part's centre to the camera."""
-        offset = -cam_from_model[:3, :3].T @ cam_from_model[:3, 3] - self._center_in_model
-        return np.asarray(offset / np.linalg.norm(offset), dtype=np.float64)
+        return direction_from(cam_from_model, self._center_in_model)
 
     def _nearest(self, cam_from_model: Array) -> int:
         """Index of the remembered direction nearest to a pose's, or -1 if all are further than a new one's."""

@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from arview.reconstruction.coverage import components_seen as components_seen
     from arview.reconstruction.coverage import count_separated as count_separated
     from arview.reconstruction.coverage import spread_deg as spread_deg
-    from arview.reconstruction.coverage import unit as unit
     from arview.reconstruction.dense.files import read_ply as read_ply
     from arview.reconstruction.dense.options import DenseOptions as DenseOptions
     from arview.reconstruction.given_poses import read_poses as read_poses
@@ -91,7 +90,6 @@ __getattr__, __dir__, __all__ = lazy_door(
             "components_seen",
             "count_separated",
             "spread_deg",
-            "unit",
         ),
         "dense.files": ("read_ply",),
         "dense.options": ("DenseOptions",),

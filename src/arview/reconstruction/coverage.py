@@ -226,10 +226,11 @@ def count_separated(directions: Array, apart_deg: float) -> int:
 
 
 def spread_deg(directions: Array) -> float:
-    """Largest angle between two directions (N,3)."""
+    """Largest angle between two directions (N,3) of any length."""
     if len(directions) < 2:
         return 0.0
-    return math.degrees(math.acos(float(np.clip((directions @ directions.T).min(), -1.0, 1.0))))
+    rays = unit(directions)
+    return math.degrees(math.acos(float(np.clip((rays @ rays.T).min(), -1.0, 1.0))))
 
 
 def _gap(directions: Array, axis: Array) -> tuple[float, Array]:

@@ -9,7 +9,6 @@ if TYPE_CHECKING:
     from arview.refinement.evidence import MIN_IN_PICTURE as MIN_IN_PICTURE
     from arview.refinement.evidence import EdgeSteps as EdgeSteps
     from arview.refinement.evidence import PoseEvidence as PoseEvidence
-    from arview.refinement.evidence import quality_of as quality_of
     from arview.refinement.gauss_newton import apply_twist as apply_twist
     from arview.refinement.gauss_newton import relative_twist as relative_twist
     from arview.refinement.kernels import STRENGTH_HALF as STRENGTH_HALF
@@ -56,7 +55,6 @@ __getattr__, __dir__, __all__ = lazy_door(
             "EdgeSteps",
             "MIN_IN_PICTURE",
             "PoseEvidence",
-            "quality_of",
         ),
         "gauss_newton": (
             "apply_twist",

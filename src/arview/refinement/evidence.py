@@ -69,12 +69,13 @@ class PoseEvidence:
     @property
     def quality(self) -> float:
         """0–1, 0.5 at `DECISION_SCORE`; 0 for a part outside the picture."""
-        return quality_of(self.score) if self.points_in_picture > MIN_IN_PICTURE else 0.0
+        return self.quality_with(0.0)
 
-
-def quality_of(score: float) -> float:
-    """Logistic function of a score, 0–1."""
-    return float(1.0 / (1.0 + np.exp(-(score - DECISION_SCORE) * SCORE_SLOPE)))
+    def quality_with(self, more_score: float) -> float:
+        """The quality where other evidence adds to the score."""
+        if self.points_in_picture <= MIN_IN_PICTURE:
+            return 0.0
+        return float(1.0 / (1.0 + np.exp(-(self.score + more_score - DECISION_SCORE) * SCORE_SLOPE)))
 
 
 class EdgeTerms(NamedTuple):

@@ -8,8 +8,9 @@ import numpy as np
 
 from arview.geometry import Array
 
-CORRELATED_POINTS = 8.0
-"""Neighbouring edge points that share one error, because points along one edge are measured every few pixels."""
+POINTS_BETWEEN_FRAMES, POINTS_OF_FRAME = 8.0, 4.0
+"""Neighbouring edge points that share one error, because points along one edge are measured every few pixels: where the
+poses of two frames are compared, and for the pose of one frame."""
 COMMON_SHIFT_PX, COMMON_SIZE_PX = 0.6, 0.3
 """Standard deviations of what all points share: a shift, and a change of the part's radius or its turn. Errors of lens,
 CAD and light do not average out."""
@@ -17,13 +18,13 @@ MOTION_SHIFT, MOTION_SIZE = 0.1, 0.05
 """Shares of the motion since the last frame by which they grow: blur and rolling shutter move all points alike."""
 
 
-def covariance_of(information: Array, quality: float, diameter_mm: float) -> Array:
+def covariance_of(information: Array, quality: float, diameter_mm: float, correlated_points: float) -> Array:
     """Covariance (6,6) of a twist (rad, mm) for an information (6,6) and the quality of its pose.
 
     It is the inverse of the information, enlarged by the number of points that share an error, and limited by half a
     radian and half a diameter.
     """
-    scale = CORRELATED_POINTS / max(quality, 0.05)
+    scale = correlated_points / max(quality, 0.05)
     max_sigma = np.array([0.5] * 3 + [0.5 * diameter_mm] * 3)
     covariance = np.linalg.inv(information / scale + np.diag(1.0 / max_sigma**2))
     return np.asarray(covariance, dtype=np.float64)

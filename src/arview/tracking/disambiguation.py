@@ -101,13 +101,18 @@ class RoundTurns:
         self._frames = self._votes = 0
         self.fitting: list[Array] = []
 
+    def is_due(self) -> bool:
+        """Whether this frame is compared; asked once in each frame."""
+        self._frames += 1
+        is_turn = self._frames <= FIRST_FRAMES or self._frames % EVERY_FRAMES == 0
+        return self._axis is not None and is_turn
+
     def better(
         self, image: NDArray[np.uint8], cam_from_model: Array, covariance: Array, colors: ColorModel
     ) -> Array | None:
         """The turn (4,4) of the model at which the picture shows it, if that is not its pose; else None.
 
-        It is asked in each frame, and after the first ones mostly compares nothing. A turn must be better at two
-        comparisons.
+        A turn must be better at two comparisons.
 
         Args:
             image: (H,W,3) uint8 RGB of the camera's size.
@@ -115,9 +120,7 @@ class RoundTurns:
             covariance: (6,6) of its twist.
             colors: of part and background.
         """
-        self._frames += 1
-        if self._axis is None or (self._frames > FIRST_FRAMES and self._frames % EVERY_FRAMES):
-            return None
+        assert self._axis is not None
         changes, evidence = self._compared(image, cam_from_model, colors)
         is_told = changes >= MIN_CHANGE
         best = int(np.argmax(np.where(is_told, changes * evidence, -np.inf)))

@@ -201,8 +201,9 @@ class PartSearch:
         if not found:
             return None
         base = self._turned(image, found[0], components, frames_lost)
-        alternatives, quality = base.alternatives, base.quality
-        return FoundPose(base.cam_from_model, math.inf, alternatives=alternatives, rests_on_base=True, quality=quality)
+        return FoundPose(
+            base.cam_from_model, math.inf, alternatives=base.alternatives, rests_on_base=True, quality=base.quality
+        )
 
     def find_whole(
         self, image: NDArray[np.uint8], components: AssemblyMonitor, cam_from_model: Array
@@ -287,12 +288,12 @@ class PartSearch:
             if is_used and last is not None:
                 guesses = self._remembered(image, last, MIN_RESTING_SCORE)
             return self.detector.detect_near(image, guesses) if guesses else []
+        if self._options.finder is not None:
+            return list(self._options.finder.detect(image))
         if is_used:
             if last is not None and state.frames_without_pose <= EAGER_FRAMES:
                 guesses = self._remembered(image, last)
             guesses = guesses or self._remembered(image)
-        if self._options.finder is not None:
-            return list(self._options.finder.detect(image))
         return self.detector.detect(image, max_results=1, guesses=guesses, searches=searches)
 
     def _remembered(self, image: NDArray[np.uint8], near: Array | None = None, min_score: float = 0.0) -> list[Array]:

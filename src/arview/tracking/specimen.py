@@ -23,7 +23,7 @@ from arview.core.messages import joined, sentence
 from arview.detection import RejectedHypothesis
 from arview.errors import MismatchError
 from arview.fiducials import SerialNumbers
-from arview.geometry import Array, apply, invert
+from arview.geometry import Array, direction_from, invert
 from arview.guideviews import GuideViewSet
 from arview.pose import Identity, Pose, TrackingState
 from arview.tracking.diagnosis import diagnose_loss
@@ -237,15 +237,16 @@ class SpecimenTracking:
         """Quality of a pose: until other views have supported it, it is no surer than what found it."""
         s = self._state
         if s.found_direction is not None and self.state == TrackingState.TRACKED:
-            cosine = float(self._seen_from(estimate.cam_from_model) @ s.found_direction)
+            direction = direction_from(estimate.cam_from_model, self.views.center_in_model)
+            cosine = float(direction @ s.found_direction)
             if cosine < math.cos(math.radians(CONFIRMING_DEG)):
                 s.found_quality, s.found_direction = 1.0, None
         return min(pose_probability(pose_features(estimate, covariance, self.views.diameter_mm)), s.found_quality)
 
-    def _seen_from(self, cam_from_model: Array) -> Array:
-        """Unit vector (3,), in the model frame, from the part's centre towards the camera at a pose (4,4)."""
-        towards = -apply(cam_from_model, self.views.center_in_model) @ cam_from_model[:3, :3]
-        return np.asarray(towards / np.linalg.norm(towards))
+    def _note_found(self, found: FoundPose, estimate: Estimate) -> None:
+        """Note how sure what found the pose is, and from where the part is seen in that frame."""
+        direction = direction_from(estimate.cam_from_model, self.views.center_in_model)
+        self._state.found_quality, self._state.found_direction = found.quality, direction
 
     # --- Follow a pose ------------------------------------------------------------------------------------
 
@@ -309,7 +310,7 @@ class SpecimenTracking:
         if found.guide_cam_from_model is not None:
             s.reason = ALIGN
         s.hypotheses = _alternatives_of(found)
-        s.found_quality, s.found_direction = found.quality, self._seen_from(estimate.cam_from_model)
+        self._note_found(found, estimate)
         self._turns.reset()
         s.begin(estimate.quality >= found.lock_quality)
         return estimate
@@ -343,9 +344,10 @@ class SpecimenTracking:
         if (turn := self.components.better_turn) is not None:
             return self._restart(image, estimate.cam_from_model @ turn.model_from_model, turn), reason
         pose = estimate.cam_from_model
-        colors, covariance = self.tracker.state.appearance.colors, self.tracker.covariance(estimate)
-        if (better := self._turns.better(image, pose, covariance, colors)) is not None:
-            return self._restart(image, pose @ better), reason
+        if self._turns.is_due():
+            colors, covariance = self.tracker.state.appearance.colors, self.tracker.covariance(estimate)
+            if (better := self._turns.better(image, pose, covariance, colors)) is not None:
+                return self._restart(image, pose @ better), reason
         self.tracker.hold_turn(self._turns.unknown_twist)
         if self._turns.fitting and not s.hypotheses and not reason:
             s.apply(Event.CONTRADICTED)
@@ -368,7 +370,9 @@ class SpecimenTracking:
         found = self.search.find_base(image, [0], self.components)
         if found is None or self._is_placed_by(found, estimate):
             return estimate
-        return self._restart(image, found.cam_from_model, rests_on_base=True)
+        restarted = self._restart(image, found.cam_from_model, rests_on_base=True)
+        self._note_found(found, restarted)
+        return restarted
 
     def _recheck_whole(self, image: NDArray[np.uint8], estimate: Estimate) -> Estimate:
         """Go on where the whole part is found, if only its base was found before and that elsewhere."""
@@ -376,7 +380,9 @@ class SpecimenTracking:
         if found is None or self._is_placed_by(found, estimate):
             return estimate
         self._state.hypotheses = _alternatives_of(found)
-        return self._restart(image, found.cam_from_model)
+        restarted = self._restart(image, found.cam_from_model)
+        self._note_found(found, restarted)
+        return restarted
 
     def _is_placed_by(self, found: FoundPose, estimate: Estimate) -> bool:
         """Whether a search found the part where it is followed, by which its pose is known to be right."""

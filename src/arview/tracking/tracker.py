@@ -24,7 +24,6 @@ from arview.guideviews import GuideViewSet
 from arview.refinement import (
     FAR_STAGES,
     LAST_STAGES,
-    MIN_IN_PICTURE,
     NEAR_STAGES,
     PartView,
     PoseRefiner,
@@ -32,11 +31,10 @@ from arview.refinement import (
     TextureModality,
     apply_twist,
     median_brightness_ratio,
-    quality_of,
     relative_twist,
     value_bins,
 )
-from arview.tracking.covariance import common_covariance, covariance_of
+from arview.tracking.covariance import POINTS_BETWEEN_FRAMES, POINTS_OF_FRAME, common_covariance, covariance_of
 from arview.tracking.estimate import Estimate
 from arview.tracking.motion import innovation, normalised_covariance, squared_motion_distance
 from arview.tracking.search.wide_search import WideSearch
@@ -102,8 +100,6 @@ EXPOSURE_LIMITS = (0.2, 5.0)
 """Smallest and largest exposure relative to the first frame."""
 SPREAD_RATE = 0.3
 """Share by which the estimated blur of the edges follows each frame."""
-CAUTION = 0.5
-"""Factor by which fewer edge points share one error where a pose is compared with the truth instead of the last one."""
 VELOCITY_DECAY = 0.9
 """Share of the last frame's motion that is expected in the next frame."""
 
@@ -338,7 +334,7 @@ class Tracker:
     def _innovation(self, frame: FrameContext) -> tuple[Array, Array]:
         """Difference (6,) of the best pose from the predicted one, and covariance (6,6) of the best pose."""
         best = frame.found
-        covariance = covariance_of(best.information, best.evidence.quality, self.diameter_mm)
+        covariance = covariance_of(best.information, best.evidence.quality, self.diameter_mm, POINTS_BETWEEN_FRAMES)
         difference = innovation(best.cam_from_body, frame.predicted, self.diameter_mm)
         return difference, normalised_covariance(covariance, best.cam_from_body, self.diameter_mm)
 
@@ -352,9 +348,7 @@ class Tracker:
     def _quality(self, frame: FrameContext) -> float:
         """Quality of the selected pose by the evidence of edges and colours, and by texture."""
         evidence = frame.found.evidence
-        if frame.found.matches is not None and evidence.points_in_picture > MIN_IN_PICTURE:
-            return quality_of(evidence.score + TEXTURE_SCORE * frame.found_share)
-        return evidence.quality
+        return evidence.quality_with(0.0 if frame.found.matches is None else TEXTURE_SCORE * frame.found_share)
 
     def _as_predicted(self, frame: FrameContext, unknown_twist: Array) -> RefinedPose:
         """The best pose with the predicted turn about an axis, and without what its information says of that turn."""
@@ -483,6 +477,6 @@ class Tracker:
         It holds for the error of the pose in this frame, see `common_covariance`.
         """
         cam_from_body = estimate.cam_from_model @ self.refiner.part.model_from_body
-        own = covariance_of(estimate.information / CAUTION, estimate.quality, self.diameter_mm)
+        own = covariance_of(estimate.information, estimate.quality, self.diameter_mm, POINTS_OF_FRAME)
         radius_px, motion = self.refiner.radius_px(cam_from_body), self.state.velocity / VELOCITY_DECAY
         return own + common_covariance(cam_from_body, radius_px, self.diameter_mm, motion)

@@ -8,12 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from arview import reconstruction
 from arview.cad import Part
 from arview.camera import Camera
 from arview.core.checks import check_type
 from arview.core.messages import Message, sentence
-from arview.geometry import Array, apply, check_rigid
+from arview.geometry import Array, apply, check_rigid, direction_from
 from arview.pose import Pose, TrackingState
 from arview.station.capture import words
 from arview.station.capture.advice import CaptureAdvice, CellState, RingDistance
@@ -221,7 +220,7 @@ class CaptureGuide:
 
     def _direction(self, cam_from_model: Array) -> Array:
         """(3,) unit vector from the part's centre to the camera."""
-        return reconstruction.unit(-cam_from_model[:3, :3].T @ cam_from_model[:3, 3] - self._center)
+        return direction_from(cam_from_model, self._center)
 
     def _cell(self, cam_from_model: Array) -> int:
         """The cell of the dome nearest to the camera."""

@@ -11,7 +11,7 @@ from arview import reconstruction
 from arview.cad import Part
 from arview.camera import Camera
 from arview.core.messages import sentence
-from arview.geometry import Array, apply
+from arview.geometry import Array, apply, direction_from
 from arview.station.capture import words
 from arview.station.capture.advice import ComponentNeed
 from arview.station.capture.dome import CaptureDome, component_points
@@ -88,7 +88,7 @@ class CaptureNeeds:
         """Count a photo at a pose (4,4)."""
         seen = np.array(reconstruction.components_seen(self._model, self._camera, cam_from_model))
         eye = -cam_from_model[:3, :3].T @ cam_from_model[:3, 3]
-        direction = reconstruction.unit(eye - self._center)
+        direction = direction_from(cam_from_model, self._center)
         self._known.add(self._view(seen, eye))
         self._directions.append(direction)
         cell = self._dome.nearest(direction)

@@ -78,6 +78,6 @@ def _component_row(name: str, photos: NDArray[np.int64], rays: Array, count: int
     return {
         "name": name,
         "photos": photos.tolist(),
-        "spread_deg": reconstruction.spread_deg(reconstruction.unit(rays[photos])),
+        "spread_deg": reconstruction.spread_deg(rays[photos]),
         "remark": f"seen in {len(photos)} of {count} photos only: take some from where it is not hidden" if few else "",
     }
