@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 
 from arview.geometry import Array
+from arview.pose import TrackingState
 from arview.tracking import TrackingSession
 from arview.tracking.covariance import common_covariance
 from arview.tracking.probability import PoseFeatures, pose_probability
-from helpers.synthetic import CAMERA, assembly, assembly_views, error, path, picture, pose_from
+from arview.tracking.specimen import LITTLE_SEEN
+from helpers.synthetic import CAMERA, assembly, assembly_views, error, part_box, path, picture, pose_from
 
 SURE = PoseFeatures(0.85, 0.05, 0.5, 0.7, 0.0, 0.0, 0.0, 0.0, 1.0, -0.3)
 """Features of a pose that nothing speaks against."""
@@ -60,3 +62,24 @@ def test_errors_that_all_points_share_are_a_shift_across_and_a_change_of_size_al
     moved = common_covariance(pose, 100.0, 200.0, np.array([0.0, 0.0, 0.0, 20.0, 0.0, 0.0]))
     assert np.all(np.linalg.eigvalsh(moved - covariance) > -1e-12)
     assert 1.0 < np.sqrt(np.trace(moved[3:, 3:]) / np.trace(covariance[3:, 3:])) < 3.0
+
+
+def test_a_given_pose_that_is_little_seen_is_followed_in_doubt() -> None:
+    """A card goes with the part and hides more than half of it: too little for `tracked`, enough to follow."""
+    truths = path(50)
+    reasons = []
+    session = TrackingSession.of(assembly_views(), CAMERA, assembly(), initial_cam_from_model=truths[0])
+    for index, truth in enumerate(truths):
+        left, top, right, bottom = part_box(truth)
+        card = left, top, int(left + 0.55 * (right - left)), bottom
+        (pose,) = session.process(picture(truth, seed=index, card=card), index, index / 30.0)
+        assert pose.state is TrackingState.CRITICAL
+        reasons.append(pose.reason)
+        assert pose.cam_from_model is not None and error(pose.cam_from_model, truth)[2] < 1.0
+    assert reasons[:10] == [LITTLE_SEEN] * 10
+
+
+def test_a_given_pose_at_which_nothing_is_seen_is_refused() -> None:
+    session = TrackingSession.of(assembly_views(), CAMERA, assembly(), initial_cam_from_model=path(1)[0])
+    (pose,) = session.process(picture(None), 0, 0.0)
+    assert pose.state is TrackingState.SEARCHING and pose.cam_from_model is None

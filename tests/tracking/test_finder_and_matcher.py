@@ -8,13 +8,18 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from arview.cad import ViewRange
 from arview.detection import Detection
 from arview.geometry import Array, apply
+from arview.guideviews import GuideViewOptions
+from arview.guideviews.cache import cached_guide_views
 from arview.pose import TrackingState
 from arview.tracking import PointMatches, SessionOptions, Tracker, TrackerOptions, TrackingSession
-from helpers.synthetic import CAMERA, assembly, assembly_views, background, error, path, picture, pose_from, wrong
+from arview.tracking.specimen import PLAIN_FACE
+from helpers.synthetic import CAMERA, assembly, assembly_views, background, block, error, path, picture, pose_from, wrong
 
 POSES = path(12)
+ALL_ROUND = ViewRange((300.0, 640.0), elevation_deg=(-10.0, 75.0), azimuth_deg=(-80.0, 80.0), roll_deg=(-20.0, 20.0))
 POINTS_MM = np.random.default_rng(3).uniform((0.0, 0.0, 12.0), (160.0, 120.0, 12.0), (60, 3))
 """Points of the plate that a matcher finds."""
 
@@ -73,6 +78,17 @@ def test_a_pose_is_no_surer_than_what_found_it_until_other_views_confirm_it() ->
     assert {pose.state for pose in poses} == {TrackingState.TRACKED}
     assert [pose.quality for pose in poses[:4]] == [0.7] * 4
     assert min(pose.quality for pose in poses[-2:]) > 0.9
+
+
+def test_one_plain_face_is_ambiguous_until_another_side_is_seen() -> None:
+    """A block is found from in front, where any rectangle fits as well; then the camera goes round it."""
+    truths = [pose_from(angle_deg, 0.0, 420.0, block()) for angle_deg in (0.0, 0.0, 0.0, 8.0, 16.0, 24.0)]
+    views = cached_guide_views(block(), ALL_ROUND, GuideViewOptions(renderer="zbuffer"))
+    session = TrackingSession.of(views, CAMERA, block(), SessionOptions(finder=ToldFinder([truths[0]])))
+    poses = [session.process(picture(truth, block(), seed=k), k, k / 30.0)[0] for k, truth in enumerate(truths)]
+    assert [pose.state for pose in poses] == [TrackingState.CRITICAL] * 3 + [TrackingState.TRACKED] * 3
+    assert {pose.reason for pose in poses[:3]} == {PLAIN_FACE}
+    assert poses[-1].cam_from_model is not None and error(poses[-1].cam_from_model, truths[-1], block())[2] < 0.5
 
 
 def test_what_is_not_found_is_not_tracked(monkeypatch: pytest.MonkeyPatch) -> None:

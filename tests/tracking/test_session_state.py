@@ -41,7 +41,7 @@ def test_support_tracks_weakness_warns_and_failure_keeps_the_part_lost() -> None
 def test_a_pose_is_found_confirmed_and_lost() -> None:
     s = SessionState()
     assert not s.has_pose
-    s.begin(is_confirmed=False)
+    s.begin(is_confirmed=False, is_given=False)
     assert (s.state, s.is_confirmed, s.was_tracked, s.has_pose) == (CRITICAL, False, False, True)
     s.confirm()
     assert (s.state, s.is_confirmed, s.was_tracked) == (TRACKED, True, True)
@@ -56,7 +56,7 @@ def test_a_pose_is_found_confirmed_and_lost() -> None:
 @pytest.mark.parametrize(("was_tracked", "expected"), [(False, SEARCHING), (True, LOST)])
 def test_an_unconfirmed_pose_of_the_guide_view_is_retracted(was_tracked: bool, expected: TrackingState) -> None:
     s = SessionState(LOST if was_tracked else SEARCHING, was_tracked=was_tracked, frames_without_pose=7, reason="wait")
-    s.begin(is_confirmed=False)
+    s.begin(is_confirmed=False, is_given=False)
     s.retract()
     assert (s.state, s.frames_without_pose, s.reason, s.loss_reason) == (expected, 7, "wait", "")
 

@@ -29,7 +29,7 @@ from arview.tracking.base_detection import BaseDetection
 from arview.tracking.diagnosis import NOTHING_IN_VIEW, diagnose_picture, diagnose_search
 from arview.tracking.search.guided_init import GuidedInit, GuidedPose
 from arview.tracking.search.search_plan import EAGER_FRAMES, SearchPlan
-from arview.tracking.session_options import TRACKED_QUALITY, SessionOptions
+from arview.tracking.session_options import LOST_QUALITY, TRACKED_QUALITY, SessionOptions
 from arview.tracking.session_state import SessionState
 from arview.tracking.several.specimens import CoveredPlace, is_same_specimen, searched_picture
 
@@ -66,6 +66,7 @@ class FoundPose(NamedTuple):
         rests_on_base: whether only the base was found, which says nothing of the other components.
         guide_cam_from_model: (4,4) guide pose to which it must stay near; None: it was not found by alignment.
         quality: 0–1, probability by what found it that it is right; 1 for what was not found by the detector.
+        is_given: whether it is near the initial pose; the part is followed from there with weak support, too.
     """
 
     cam_from_model: Array
@@ -75,6 +76,7 @@ class FoundPose(NamedTuple):
     rests_on_base: bool = False
     guide_cam_from_model: Array | None = None
     quality: float = 1.0
+    is_given: bool = False
 
 
 class PartSearch:
@@ -268,7 +270,7 @@ class PartSearch:
             state.reason = "the part is outside the picture at the initial pose"
         else:
             # Where the part should be is known, so that less can be mistaken for it than in a search.
-            yield FoundPose(found.cam_from_model, lock_quality=TRACKED_QUALITY)
+            yield FoundPose(found.cam_from_model, TRACKED_QUALITY, LOST_QUALITY, is_given=True)
 
     def _at_guide_pose(
         self, image: NDArray[np.uint8], state: SessionState, guide_cam_from_model: Array

@@ -64,6 +64,7 @@ class SessionState:
             none since the loss.
         parts_left: parts of the thorough search that have not been made since then.
         is_confirmed: whether the present pose has been supported clearly in a frame since it was found.
+        is_given: whether the present pose began at the initial pose of the session.
         is_supported: whether the last frame supported the pose clearly, whatever the components say.
         was_tracked: whether the part has been tracked since the last reset.
         recent_poses: the last poses (4,4) with support, at most two, oldest first.
@@ -71,6 +72,7 @@ class SessionState:
         hypotheses: near-symmetric alternatives of the present pose.
         found_quality: 0–1, probability by what found the pose that it is right, until other views have confirmed it.
         found_direction: (3,) unit vector, in the model frame, from which the part was seen when it was found.
+        lines_shown: largest number of distinct lines that the part has shown since it was found.
         reason: why the last search found nothing.
         loss_reason: why the part was lost.
     """
@@ -85,6 +87,7 @@ class SessionState:
     searched_picture: NDArray[np.uint8] | None = None
     parts_left: int = 0
     is_confirmed: bool = False
+    is_given: bool = False
     is_supported: bool = False
     was_tracked: bool = False
     recent_poses: tuple[Array, ...] = ()
@@ -92,6 +95,7 @@ class SessionState:
     hypotheses: HypothesisSet = field(default_factory=lambda: HypothesisSet([]))
     found_quality: float = 1.0
     found_direction: Array | None = None
+    lines_shown: float = 0.0
     reason: str = ""
     loss_reason: str = ""
 
@@ -108,10 +112,10 @@ class SessionState:
         """
         self.state = TRANSITIONS[self.state, event]
 
-    def begin(self, is_confirmed: bool) -> None:
-        """A pose was found; unless it is confirmed, the next frame must support it."""
+    def begin(self, is_confirmed: bool, is_given: bool) -> None:
+        """A pose was found, or given; unless it is confirmed or given, the next frame must support it."""
         self.poor_frames = self.critical_frames = 0
-        self.is_confirmed = is_confirmed
+        self.is_confirmed, self.is_given, self.lines_shown = is_confirmed, is_given, 0.0
         self.was_tracked |= is_confirmed
         self.recent_poses = ()
         self.apply(Event.SUPPORTED if is_confirmed else Event.WEAK)

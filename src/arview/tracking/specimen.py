@@ -23,14 +23,14 @@ from arview.core.messages import joined, sentence
 from arview.detection import RejectedHypothesis
 from arview.errors import MismatchError
 from arview.fiducials import SerialNumbers
-from arview.geometry import Array, direction_from, invert
+from arview.geometry import Array, are_near, direction_from, invert
 from arview.guideviews import GuideViewSet
 from arview.pose import Identity, Pose, TrackingState
 from arview.tracking.diagnosis import diagnose_loss
 from arview.tracking.disambiguation import HypothesisSet, RoundTurns
 from arview.tracking.estimate import Estimate
 from arview.tracking.identity import IdentityMonitor
-from arview.tracking.part_search import ALIGN, FoundPose, PartSearch
+from arview.tracking.part_search import ALIGN, ALTERNATIVE_SHARE, FoundPose, PartSearch
 from arview.tracking.pose_recheck import LocalSearchRecheck
 from arview.tracking.probability import pose_features, pose_probability
 from arview.tracking.session_options import CRITICAL_QUALITY, LOST_QUALITY, TRACKED_QUALITY, SessionOptions
@@ -47,6 +47,12 @@ CONFIRMING_DEG = 10.0
 """Angle between two directions of view; a pose that is ``tracked`` from both is right or symmetric."""
 MIN_IN_PICTURE = 0.25
 """Share of the outline inside the picture below which no pose is kept."""
+LITTLE_SEEN = "little of the outline is seen: the part is hidden, or differs from its CAD"
+"""Reason given while a part is followed from a given pose that the picture never supported clearly."""
+FACE_LINES = 5.0
+"""Distinct lines that a view must show more of than one face of a box does, which any rectangle in the picture fits."""
+PLAIN_FACE = "ambiguous: one plain face fits any other of its shape; show another side"
+"""Reason given while that is all that has been seen."""
 SAME_SPECIMEN = (Identity.FOLLOWED, Identity.CONFIRMED)
 """With these identities what was known of the components before a loss is taken up."""
 
@@ -258,7 +264,7 @@ class SpecimenTracking:
         is_outside = estimate.evidence.points_in_picture < MIN_IN_PICTURE or not is_possible
         is_poor = is_outside or estimate.quality < LOST_QUALITY
         s.poor_frames = s.poor_frames + 1 if is_poor else 0
-        if s.poor_frames >= LOST_FRAMES or (is_poor and not s.is_confirmed):
+        if s.poor_frames >= LOST_FRAMES or (is_poor and not (s.is_confirmed or s.is_given)):
             recent = (s.recent_poses[0], s.recent_poses[1]) if len(s.recent_poses) == 2 else None
             return self._give_up(diagnose_loss(image, estimate, recent, self.camera, self.views, is_possible))
         if not is_poor:
@@ -269,9 +275,20 @@ class SpecimenTracking:
                 return estimate, ""
         s.apply(Event.WEAK)
         s.critical_frames += 1
-        if s.critical_frames > CRITICAL_FRAMES or not s.is_confirmed:
+        is_given = s.is_given and not s.is_confirmed
+        if is_given and s.critical_frames > CRITICAL_FRAMES and not self._is_elsewhere(image, estimate):
+            s.critical_frames = 0
+        if s.critical_frames > CRITICAL_FRAMES or not (s.is_confirmed or is_given):
             return self._give_up("the outline is not seen where it should be")
+        if is_given:
+            return estimate, LITTLE_SEEN
         return estimate, "the pose jumps" if estimate.is_restless else "the outline is hardly seen"
+
+    def _is_elsewhere(self, image: NDArray[np.uint8], estimate: Estimate) -> bool:
+        """Whether a quick search finds the part at another pose than a weakly supported one."""
+        found = self.search.anywhere(image, 1, False)
+        apart_mm = ALTERNATIVE_SHARE * self.views.diameter_mm
+        return any(not are_near(one.cam_from_model, estimate.cam_from_model, apart_mm, CONFIRMING_DEG) for one in found)
 
     def _give_up(self, reason: str) -> tuple[None, str]:
         """Give the pose up; one from the guide view that was never confirmed leaves the session waiting as before."""
@@ -294,7 +311,8 @@ class SpecimenTracking:
         for found in self.search.proposals(image, s, self.components):
             estimate = self._begin(image, found)
             if estimate is not None:
-                return estimate, "" if s.is_confirmed else "found, to be confirmed"
+                weak = LITTLE_SEEN if s.is_given else "found, to be confirmed"
+                return estimate, "" if s.is_confirmed else weak
         return None, s.reason
 
     def _begin(self, image: NDArray[np.uint8], found: FoundPose) -> Estimate | None:
@@ -312,7 +330,7 @@ class SpecimenTracking:
         s.hypotheses = _alternatives_of(found)
         self._note_found(found, estimate)
         self._turns.reset()
-        s.begin(estimate.quality >= found.lock_quality)
+        s.begin(estimate.quality >= found.lock_quality, found.is_given)
         return estimate
 
     def _restart(
@@ -353,7 +371,7 @@ class SpecimenTracking:
             s.apply(Event.CONTRADICTED)
             return estimate, "ambiguous: it looks the same when it is turned; show another side"
         if not s.hypotheses:
-            return estimate, reason
+            return estimate, reason if reason or not self._is_plain(estimate) else PLAIN_FACE
         others = s.hypotheses.poses(pose)
         score, *other_scores = [score for _, score in self.tracker.refined_near(image, [pose, *others])]
         if (better := s.hypotheses.update(score, other_scores)) is not None:
@@ -364,6 +382,17 @@ class SpecimenTracking:
         s.apply(Event.CONTRADICTED)
         poses = "another pose fits" if len(s.hypotheses) == 1 else f"{len(s.hypotheses)} other poses fit"
         return estimate, f"ambiguous: {poses} as well; show another side"
+
+    def _is_plain(self, estimate: Estimate) -> bool:
+        """Whether the part, found by a search, has shown no more than one plain face; it is in doubt then."""
+        s = self._state
+        if s.lines_shown < FACE_LINES:
+            lines = self.search.local.view_lines(estimate.cam_from_model @ self._part.model_from_body)
+            s.lines_shown = max(s.lines_shown, lines)
+        is_plain = s.lines_shown < FACE_LINES and not s.is_given
+        if is_plain:
+            s.apply(Event.CONTRADICTED)
+        return is_plain
 
     def _recheck_base(self, image: NDArray[np.uint8], estimate: Estimate) -> Estimate:
         """Search again for a part of which little is seen, and go on where it is if that is elsewhere."""

@@ -19,6 +19,8 @@ EAGER_FRAMES = 2
 """Frames after a loss in each of which the part is searched for."""
 SEARCH_EVERY = 3
 """After ``EAGER_FRAMES`` the part is searched for only so many frames after the last search."""
+FIRST_FRAMES = 12
+"""Frames in each of which a part that was never found is searched for; afterwards it is searched for like a lost one."""
 THOROUGH_EVERY = 24
 """Frames from the end of one thorough search for a lost part to the next."""
 THOROUGH_PARTS = 3
@@ -48,7 +50,7 @@ class SearchPlan:
         """
         s = state
         frame = s.frames_without_pose
-        if s.state == TrackingState.SEARCHING:
+        if s.state == TrackingState.SEARCHING and frame <= FIRST_FRAMES:
             return None if frame % (2 * SEARCH_EVERY) == 1 else [0]
         if frame > EAGER_FRAMES and frame - s.last_search_frame < SEARCH_EVERY:
             return []
