@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import pytest
 
 from arview.detection.confidence import (
+    CUT_GAIN,
     MIN_OUTLINE,
     ConfidenceTerms,
     Margins,
@@ -78,12 +80,22 @@ def test_a_cut_outline_counts_less() -> None:
     assert outline_score(cut, cut, 1.0) == pytest.approx(0.5 * whole)
 
 
-def test_a_cut_pose_must_show_a_clear_outline_that_the_contour_verifier_confirms() -> None:
+def odds(terms: ConfidenceTerms, share_outside: float) -> float:
+    probability = pose_probability(terms, share_outside)
+    return probability / (1.0 - probability)
+
+
+def test_a_cut_pose_with_a_clear_outline_loses_little_up_to_two_fifths() -> None:
     clear = terms(0.3)._replace(contour=2.0, appearance=3.0)
-    whole, cut = pose_probability(clear), pose_probability(clear, share_outside=0.5)
-    assert whole > 0.9 and cut > whole - 0.05
-    for doubtful in (clear._replace(outline=0.0), clear._replace(contour=-3.0)):
-        cut, whole = pose_probability(doubtful, share_outside=0.5), pose_probability(doubtful)
-        assert cut / (1.0 - cut) < 0.1 * whole / (1.0 - whole)
-    by_share = [pose_probability(clear._replace(outline=0.05), share_outside=share) for share in (0.0, 0.2, 0.4, 0.6)]
-    assert by_share == sorted(by_share, reverse=True) and by_share[0] > by_share[-1]
+    assert pose_probability(clear) > 0.9 and pose_probability(clear, 0.4) > pose_probability(clear) - 0.05
+    assert odds(clear, 0.5) < 0.5 * odds(clear, 0.4)
+
+
+def test_a_cut_pose_is_confirmed_by_the_verifiers_or_by_its_outline() -> None:
+    """The verifiers alone give a cut pose what they give a whole one, less its share outside; the outline alone less
+    still, unless it is clear."""
+    verified = terms(0.0)._replace(contour=-3.0, appearance=3.0)
+    assert odds(verified, 0.35) == pytest.approx(odds(verified, 0.0) * math.exp(CUT_GAIN - 0.35), rel=1e-6)
+    by_outline = terms(0.05)._replace(contour=-0.5, appearance=-4.0)
+    by_share = [pose_probability(by_outline, share) for share in (0.1, 0.25, 0.4, 0.6)]
+    assert by_share == sorted(by_share, reverse=True) and by_share[0] > 1.2 * by_share[-1]

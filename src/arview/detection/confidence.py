@@ -41,6 +41,12 @@ MAX_CUT_LOSS = 8.0
 """Log odds that a pose entirely outside the picture would lose. A pose cut by the picture's border loses its share of
 them unless the outline score reaches ``MIN_OUTLINE`` and the contour verifier confirms what is left, because a part of
 an outline fits clutter more often than a whole one."""
+CUT_GAIN, CUT_GAIN_SHARE = 1.0, 0.1
+"""Log odds by which the regression with the verifiers takes cut poses for less likely than they are, because these saw
+few, and the share outside the picture from which it does so."""
+FAR_OUTSIDE, FAR_OUTSIDE_LOSS = 0.4, 14.0
+"""Share of the outline outside the picture from which what is left fits clutter, and the log odds lost for each whole
+share beyond it."""
 CUT_CONTOUR = -0.1
 CUT_SLOPE = 3.0
 """Score of the contour verifier at which a cut pose counts as half confirmed, and slope of the logistic function around
@@ -275,12 +281,14 @@ def pose_probability(terms: ConfidenceTerms, share_outside: float = 0.0) -> floa
         share_outside: of the outline, cut off by the picture's border.
     """
     weights = confidence_weights()
-    total = weights.probability_bias + _weighted(weights.probability, terms)
+    total = verified = weights.probability_bias + _weighted(weights.probability, terms)
     if terms.outline >= MIN_OUTLINE:
         total = max(total, weights.by_outline_bias + _weighted(weights.by_outline, terms))
     is_confirmed = 1.0 / (1.0 + math.exp(-CUT_SLOPE * (terms.contour - CUT_CONTOUR)))
     is_clear = min(max(terms.outline, 0.0) / MIN_OUTLINE, 1.0) * is_confirmed
     total -= MAX_CUT_LOSS * share_outside * (1.0 - is_clear)
+    total = max(total, verified + CUT_GAIN * min(share_outside / CUT_GAIN_SHARE, 1.0) - share_outside)
+    total -= FAR_OUTSIDE_LOSS * max(share_outside - FAR_OUTSIDE, 0.0)
     return 1.0 / (1.0 + math.exp(-min(max(total, -50.0), 50.0)))
 
 
