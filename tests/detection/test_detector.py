@@ -139,6 +139,22 @@ def test_symmetries_are_discovered() -> None:
 
 
 @pytest.mark.slow
+def test_symmetries_are_tested_where_the_declared_range_shows_both_poses() -> None:
+    """From one side the hidden edges of a cube are never seen; a mark on one face tells its quarter turns."""
+    half_round = ViewRange((300.0, 600.0), elevation_deg=(15.0, 70.0), azimuth_deg=(-150.0, 30.0))
+    grey = (0.5, 0.5, 0.5)
+    cube = component("cube", box((0, 0, 0), (60, 60, 60)), grey)
+    mark = component("mark", box((20, 20, 60), (50, 26, 62)), grey)
+    found = find_rotational_symmetries(
+        make_guide_views(make_model("cube", (cube,)), half_round, GuideViewOptions(subdivisions=3))
+    )
+    upright = [turn for turn in found.exact if turn[2, 2] > 0.9]
+    assert len(found.near) == 0 and len(upright) >= 2
+    marked = make_guide_views(make_model("marked", (cube, mark)), half_round, GuideViewOptions(subdivisions=3))
+    assert len(find_rotational_symmetries(marked).exact) == 0
+
+
+@pytest.mark.slow
 def test_symmetries_by_fifths_are_discovered() -> None:
     angles = np.deg2rad(72.0 * np.arange(5) + 10.0)
     grey = (0.5, 0.5, 0.5)

@@ -33,6 +33,10 @@ EXACT_SHARE = 0.997
 MAX_VIEWS = 60
 MAX_POINTS = 6000
 """Numbers of guide views and edge points that are tested."""
+MAX_TESTED, MIN_TESTED = 1500, 30
+"""Number of points that are tested at most, and below which nothing is said of a rotation."""
+RANGE_MARGIN_DEG = 6.0
+"""Angle from the nearest guide view within which a direction is in the declared range."""
 CELL = 0.006
 """Size in diameters of the cells of which one edge point is kept."""
 MIN_SHARP_SHARE = 0.2
@@ -72,14 +76,24 @@ class RotationalSymmetries:
 
 
 def find_rotational_symmetries(views: GuideViewSet) -> RotationalSymmetries:
-    """Rotations of a part onto itself, found on the edges of its guide views."""
-    points = _edge_points(views)
+    """Rotations of a part onto itself, found on the edges of its guide views.
+
+    A rotation is tested on the edges seen from where the part, rotated, is seen too; one that leads out of the declared
+    range from everywhere is none, because nothing beyond the range is known or searched.
+    """
+    points, seen_by, directions = _edge_points(views)
     tree = cKDTree(points)
+    reach = np.cos(np.deg2rad(RANGE_MARGIN_DEG))
+    step = max(1, len(points) // MAX_TESTED)
 
     def among(rotations: Array) -> RotationalSymmetries:
         exact, near = [], []
         for rotation in rotations:
-            distance, _ = tree.query(points[::4] @ rotation.T, distance_upper_bound=NEAR_DISTANCE * views.diameter_mm)
+            is_in_range = np.max(directions @ rotation.T @ views.directions.T, axis=1) > reach
+            tested = points[is_in_range[seen_by]][::step]
+            if len(tested) < MIN_TESTED:
+                continue
+            distance, _ = tree.query(tested @ rotation.T, distance_upper_bound=NEAR_DISTANCE * views.diameter_mm)
             if np.mean(distance < EXACT_DISTANCE * views.diameter_mm) >= EXACT_SHARE:
                 exact.append(rotation)
             elif np.mean(np.isfinite(distance)) >= NEAR_SHARE:
@@ -102,18 +116,20 @@ def find_rotational_symmetries(views: GuideViewSet) -> RotationalSymmetries:
     return RotationalSymmetries(exact, near, axes)
 
 
-def _edge_points(views: GuideViewSet) -> Array:
-    """Points (N,3) of the edges seen from all around, about the centre of the part."""
+def _edge_points(views: GuideViewSet) -> tuple[Array, NDArray[np.intp], Array]:
+    """Edges seen from all around: points (N,3) about the centre, the view of each, and the directions of the views."""
     step = max(1, len(views) // MAX_VIEWS)
-    features_of = [views.view(i).features for i in range(0, len(views), step)]
-    points = np.concatenate([features.edge_points for features in features_of])
-    sharp = np.concatenate([features.edge_kinds for features in features_of]) & EDGE_SHARP > 0
-    points = (points[sharp] if np.mean(sharp) > MIN_SHARP_SHARE else points) - views.center_in_model
+    shown = [views.view(i).features for i in range(0, len(views), step)]
+    points = np.concatenate([features.edge_points for features in shown])
+    seen_by = np.repeat(np.arange(len(shown)), [len(features.edge_points) for features in shown])
+    sharp = np.concatenate([features.edge_kinds for features in shown]) & EDGE_SHARP > 0
+    kept = sharp if np.mean(sharp) > MIN_SHARP_SHARE else np.ones(len(points), dtype=bool)
+    points, seen_by = points[kept] - views.center_in_model, seen_by[kept]
     # One point per cell, so that edges seen in many views count once.
     cells = np.round(points / (CELL * views.diameter_mm)).astype(np.int64)
     _, first = np.unique(cells, axis=0, return_index=True)
     chosen: NDArray[np.intp] = np.sort(first)[:: max(1, len(first) // MAX_POINTS)]
-    return np.asarray(points[chosen])
+    return np.asarray(points[chosen]), seen_by[chosen], np.asarray(views.directions[::step])
 
 
 def rotations_about(axis: Array, angles_deg: Iterable[float]) -> Array:

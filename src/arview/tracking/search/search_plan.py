@@ -20,7 +20,7 @@ EAGER_FRAMES = 2
 SEARCH_EVERY = 3
 """After ``EAGER_FRAMES`` the part is searched for only so many frames after the last search."""
 FIRST_FRAMES = 12
-"""Frames in each of which a part that was never found is searched for; afterwards it is searched for like a lost one."""
+"""Frames in each of which a part that was never found is searched for; later it is searched for like a lost one."""
 THOROUGH_EVERY = 24
 """Frames from the end of one thorough search for a lost part to the next."""
 THOROUGH_PARTS = 3
