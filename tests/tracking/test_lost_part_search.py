@@ -70,9 +70,12 @@ def test_the_first_frame_that_shows_something_else_is_searched(changed_frame: in
     assert min(frame for frame in made if frame > 12) == changed_frame
 
 
-def test_a_part_that_was_never_found_is_searched_in_every_frame() -> None:
-    made = searches_of(still(13), TrackingState.SEARCHING)
-    assert made == {frame: None if frame % 6 == 1 else [0] for frame in range(1, 14)}
+def test_a_part_that_was_never_found_is_searched_in_the_first_frames_and_then_like_a_lost_one() -> None:
+    made = searches_of(moving(40), TrackingState.SEARCHING)
+    first = {frame: None if frame % 6 == 1 else [0] for frame in range(1, 13)}
+    assert {frame: searches for frame, searches in made.items() if frame <= 12} == first
+    assert [frame for frame in made if frame > 12] == list(range(13, 41, 3))
+    assert [made[frame] for frame in (13, 16, 19, 22)] == [[1], [2], [3], [0]]
 
 
 @pytest.mark.slow
