@@ -16,7 +16,18 @@ from arview.guideviews.cache import cached_guide_views
 from arview.pose import TrackingState
 from arview.tracking import PointMatches, SessionOptions, Tracker, TrackerOptions, TrackingSession
 from arview.tracking.specimen import PLAIN_FACE
-from helpers.synthetic import CAMERA, assembly, assembly_views, background, block, error, path, picture, pose_from, wrong
+from helpers.synthetic import (
+    CAMERA,
+    assembly,
+    assembly_views,
+    background,
+    block,
+    error,
+    path,
+    picture,
+    pose_from,
+    wrong,
+)
 
 POSES = path(12)
 ALL_ROUND = ViewRange((300.0, 640.0), elevation_deg=(-10.0, 75.0), azimuth_deg=(-80.0, 80.0), roll_deg=(-20.0, 20.0))

@@ -81,7 +81,7 @@ def find_rotational_symmetries(views: GuideViewSet) -> RotationalSymmetries:
     A rotation is tested on the edges seen from where the part, rotated, is seen too; one that leads out of the declared
     range from everywhere is none, because nothing beyond the range is known or searched.
     """
-    points, seen_by, directions = _edge_points(views)
+    points, view_of, directions = _edge_points(views)
     tree = cKDTree(points)
     reach = np.cos(np.deg2rad(RANGE_MARGIN_DEG))
     step = max(1, len(points) // MAX_TESTED)
@@ -90,7 +90,7 @@ def find_rotational_symmetries(views: GuideViewSet) -> RotationalSymmetries:
         exact, near = [], []
         for rotation in rotations:
             is_in_range = np.max(directions @ rotation.T @ views.directions.T, axis=1) > reach
-            tested = points[is_in_range[seen_by]][::step]
+            tested = points[is_in_range[view_of]][::step]
             if len(tested) < MIN_TESTED:
                 continue
             distance, _ = tree.query(tested @ rotation.T, distance_upper_bound=NEAR_DISTANCE * views.diameter_mm)
@@ -121,15 +121,15 @@ def _edge_points(views: GuideViewSet) -> tuple[Array, NDArray[np.intp], Array]:
     step = max(1, len(views) // MAX_VIEWS)
     shown = [views.view(i).features for i in range(0, len(views), step)]
     points = np.concatenate([features.edge_points for features in shown])
-    seen_by = np.repeat(np.arange(len(shown)), [len(features.edge_points) for features in shown])
+    view_of = np.repeat(np.arange(len(shown)), [len(features.edge_points) for features in shown])
     sharp = np.concatenate([features.edge_kinds for features in shown]) & EDGE_SHARP > 0
     kept = sharp if np.mean(sharp) > MIN_SHARP_SHARE else np.ones(len(points), dtype=bool)
-    points, seen_by = points[kept] - views.center_in_model, seen_by[kept]
+    points, view_of = points[kept] - views.center_in_model, view_of[kept]
     # One point per cell, so that edges seen in many views count once.
     cells = np.round(points / (CELL * views.diameter_mm)).astype(np.int64)
     _, first = np.unique(cells, axis=0, return_index=True)
     chosen: NDArray[np.intp] = np.sort(first)[:: max(1, len(first) // MAX_POINTS)]
-    return np.asarray(points[chosen]), seen_by[chosen], np.asarray(views.directions[::step])
+    return np.asarray(points[chosen]), view_of[chosen], np.asarray(views.directions[::step])
 
 
 def rotations_about(axis: Array, angles_deg: Iterable[float]) -> Array:

@@ -47,6 +47,9 @@ CONFIRMING_DEG = 10.0
 """Angle between two directions of view; a pose that is ``tracked`` from both is right or symmetric."""
 MIN_IN_PICTURE = 0.25
 """Share of the outline inside the picture below which no pose is kept."""
+GIVEN_SEARCHES = (1, 4, 7, 10)
+"""Weak frames from a given pose in which the part is searched for elsewhere too; later it is every
+``CRITICAL_FRAMES``."""
 LITTLE_SEEN = "little of the outline is seen: the part is hidden, or differs from its CAD"
 """Reason given while a part is followed from a given pose that the picture never supported clearly."""
 FACE_LINES = 5.0
@@ -276,19 +279,25 @@ class SpecimenTracking:
         s.apply(Event.WEAK)
         s.critical_frames += 1
         is_given = s.is_given and not s.is_confirmed
-        if is_given and s.critical_frames > CRITICAL_FRAMES and not self._is_elsewhere(image, estimate):
-            s.critical_frames = 0
+        if is_given and (s.critical_frames in GIVEN_SEARCHES or s.critical_frames > CRITICAL_FRAMES):
+            if self._is_elsewhere(image, estimate, s.critical_frames == GIVEN_SEARCHES[0]):
+                return self._give_up("the part is not at the given pose")
+            if s.critical_frames > CRITICAL_FRAMES:
+                s.critical_frames = GIVEN_SEARCHES[-1] + 1
         if s.critical_frames > CRITICAL_FRAMES or not (s.is_confirmed or is_given):
             return self._give_up("the outline is not seen where it should be")
         if is_given:
             return estimate, LITTLE_SEEN
         return estimate, "the pose jumps" if estimate.is_restless else "the outline is hardly seen"
 
-    def _is_elsewhere(self, image: NDArray[np.uint8], estimate: Estimate) -> bool:
-        """Whether a quick search finds the part at another pose than a weakly supported one."""
-        found = self.search.anywhere(image, 1, False)
+    def _is_elsewhere(self, image: NDArray[np.uint8], estimate: Estimate, is_thorough: bool) -> bool:
+        """Whether a search finds the part, or its base alone, at another pose than a weakly supported one."""
+        found = [one.cam_from_model for one in self.search.anywhere(image, 1, is_thorough)]
+        if not found and self.components.may_be_bare:
+            base = self.search.find_base(image, None if is_thorough else [0], self.components)
+            found = [] if base is None else [base.cam_from_model]
         apart_mm = ALTERNATIVE_SHARE * self.views.diameter_mm
-        return any(not are_near(one.cam_from_model, estimate.cam_from_model, apart_mm, CONFIRMING_DEG) for one in found)
+        return any(not are_near(pose, estimate.cam_from_model, apart_mm, CONFIRMING_DEG) for pose in found)
 
     def _give_up(self, reason: str) -> tuple[None, str]:
         """Give the pose up; one from the guide view that was never confirmed leaves the session waiting as before."""
