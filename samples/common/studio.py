@@ -84,7 +84,8 @@ def _surface(kind: Kind, finish: str, name: str, rng):
     """The surface of a component. Every one has a texture of its own, so that no pattern repeats."""
     metals = {"zinc": (tx.zinc, 0.85, 0.012), "blued": (tx.blued, 0.45, 0.02), "machined": (tx.machined, 0.85, 0.012)}
     own = kind.metals.get(name.split("_")[0], "machined")
-    if finish in ("steel", "cast"):
+    is_own = finish == kind.finish and name.split("_")[0] in kind.metals
+    if finish in ("steel", "cast") or is_own:
         # Parts fixed to a casting are cast themselves, plated or turned.
         if own in ("cast", "chrome"):
             return _finished(own, 800, rng, kind.tint)
