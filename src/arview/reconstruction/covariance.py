@@ -6,11 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from arview.core.fits import robust_sigma
 from arview.geometry import Array, skew
 from arview.reconstruction.colmap import import_pycolmap
 from arview.reconstruction.types import SparseModel
 
+LOSS_PX = 0.5
+"""Residual at which Cauchy's loss of the adjustment halves the weight of an observation."""
 _RAD_PER_TANGENT = 2.0
 """Rotation vector per tangent vector of Ceres, which changes a unit quaternion by half the rotation vector."""
 
@@ -51,11 +52,25 @@ def pose_covariance(sparse: SparseModel, model: Any, adjuster: Any) -> Array | N
 
 
 def _noise_variance(sparse: SparseModel) -> float:
-    """Variance in px² of one coordinate of an observation, robust against remaining outliers."""
+    """Variance in px² by which the inverse of the adjustment's information is multiplied."""
     residuals = reprojection_residuals(sparse)
     unknowns = 3 * len(sparse.points_in_scan) + 6 * len(sparse.photos)
     fit = residuals.size / max(1, residuals.size - unknowns)  # the fitted unknowns absorb a share of the noise
-    return float(robust_sigma(residuals) ** 2 * fit)
+    return noise_variance(residuals) * fit
+
+
+def noise_variance(residuals: Array) -> float:
+    """Variance in px² of one coordinate of observations with residuals (K,2), as their robust adjustment has it.
+
+    An M-estimate has the covariance of least squares times ``E[ψ²] / E[ψ']²`` (Huber, "Robust Statistics", 1981,
+    section 7.6). The adjuster's information weighs each observation by the derivative of its loss, Cauchy's, whose mean is the
+    third factor. So tails count by what they do to the result: neither fully, as in the standard deviation of the
+    residuals, nor not at all, as in their median.
+    """
+    squares = np.sum(residuals**2, axis=1) / LOSS_PX**2
+    weights = 1.0 / (1.0 + squares)
+    slope = float(np.mean(weights - squares * weights**2))
+    return float(np.mean(weights) * np.mean(weights**2 * squares) * LOSS_PX**2 / (2.0 * slope**2))
 
 
 def reprojection_residuals(sparse: SparseModel) -> Array:

@@ -29,7 +29,7 @@ from arview.reconstruction.colmap import (
     model_of_poses,
     sparse_model_of,
 )
-from arview.reconstruction.covariance import pose_covariance
+from arview.reconstruction.covariance import LOSS_PX, pose_covariance
 from arview.reconstruction.database import emptied, write_database, write_matches
 from arview.reconstruction.features import FeatureOptions, Features, find_all_features
 from arview.reconstruction.gpu.device import torch_device
@@ -443,7 +443,7 @@ def adjust(model: Any, threads: int, refines_centre: bool, iterations: int = 25,
     pycolmap = import_pycolmap()
     options = pycolmap.BundleAdjustmentOptions(print_summary=False, refine_principal_point=refines_centre)
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
-    options.ceres.loss_function_scale = 0.5
+    options.ceres.loss_function_scale = LOSS_PX
     options.ceres.solver_options.num_threads = threads
     options.ceres.solver_options.max_num_iterations = iterations
     options.ceres.solver_options.function_tolerance = tolerance
