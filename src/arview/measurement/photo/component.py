@@ -4,12 +4,19 @@ from __future__ import annotations
 
 import numpy as np
 
-from arview.cad import Part
+from arview.cad import Model, Part, sample_surface
 from arview.geometry import Array, apply, exp_so3, log_so3, rigid
 from arview.measurement.photo.fit import RigidFit
-from arview.measurement.photo.patches import free_directions, turning_center
+from arview.measurement.photo.options import JOINT_MM
+from arview.measurement.photo.patches import free_directions, near_others, turning_center
 from arview.measurement.photo.views import PhotoViews
 from arview.measurement.types import Method, Move
+
+
+HEIGHTS_MM, HEIGHT_SHARE = (8.0, 5.6, 4.0, 2.8, 2.0, 1.4, 1.0, 0.7, 0.5), 0.1
+"""Heights above other components that are tried, and share of the surface that must be higher."""
+HEIGHT_SAMPLES = 600
+"""Samples of a component by which its height is found."""
 
 
 class MeasuredComponent:
@@ -25,6 +32,7 @@ class MeasuredComponent:
         radius_mm: half the diagonal of the bounding box.
         px_mm: size of a pixel at the component.
         free: (K,6) motions that leave its shape unchanged, see `free_directions`.
+        joint_mm: see `joint_mm`.
     """
 
     def __init__(self, views: PhotoViews, index: int, part: Part | None) -> None:
@@ -36,6 +44,7 @@ class MeasuredComponent:
         self.radius_mm = 0.5 * float(np.linalg.norm(np.ptp(self.shape.bounds_in_model, axis=0)))
         self.px_mm = views.mm_per_px(self.center)
         self.free = free_directions(self.shape, part, self.center, self.radius_mm)
+        self.joint_mm = joint_mm(views.model, index)
 
     def moved(self, place: Array, twist: Array) -> Array:
         """The place after a further twist (6,) about the point to which the place takes the centre."""
@@ -110,3 +119,16 @@ class MeasuredComponent:
             support=support,
             notes=notes,
         )
+
+
+def joint_mm(model: Model, component: int) -> float:
+    """Distance from other components within which surfaces and edges of one are dropped, see `JOINT_MM`.
+
+    Of a low component, such as the head of a screw, it is half of the height that some of its surface has above them,
+    because nothing would be left of it.
+    """
+    points = sample_surface(model.components[component], 0.5, HEIGHT_SAMPLES).points
+    for height_mm in HEIGHTS_MM:
+        if np.mean(near_others(points, model, component, height_mm)) < 1.0 - HEIGHT_SHARE:
+            break
+    return min(JOINT_MM, 0.5 * height_mm)

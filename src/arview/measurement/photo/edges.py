@@ -19,7 +19,7 @@ from arview.core.subpixel_edges import choose_steps, find_steps, linear_light
 from arview.geometry import Array, apply, invert, rigid
 from arview.measurement.photo.component import MeasuredComponent
 from arview.measurement.photo.fit import RigidFit, fit_rigid, move_rows
-from arview.measurement.photo.options import JOINT_MM, UNDETERMINED_MM
+from arview.measurement.photo.options import UNDETERMINED_MM
 from arview.measurement.photo.patches import near_others
 from arview.measurement.photo.rival_edges import EdgePoints, merged_shift_px, rival_offsets_px
 from arview.measurement.photo.views import PhotoViews
@@ -320,7 +320,7 @@ class ComponentEdges:
             apply(place, nominal), np.concatenate(tangents) @ place[:3, :3].T, np.concatenate(views).astype(np.int64)
         )
         gaps_px = rival_offsets_px(edges, self.views, RIVAL_REACH_PX)
-        apart = ~near_others(nominal, self.views.model, self.body.index, JOINT_MM)
+        apart = ~near_others(nominal, self.views.model, self.body.index, self.body.joint_mm)
         self._predicted = (place, edges.of(apart), gaps_px[apart])
         return self._predicted[1:]
 

@@ -25,6 +25,9 @@ MIN_CLEAR = 3
 GONE_SHARE = 0.6
 """A component is missing when more than this share of what it would hide is visible."""
 
+TURNS_DEG = (-2.5, 2.5, -5.0, 5.0, -8.0, 8.0)
+"""Turns on its seat from which a component is sought that neither method finds near its place."""
+
 MethodResults = dict[Method, Move | NotMeasured]
 """The outcome of each method for one component."""
 
@@ -98,6 +101,8 @@ def measure_component(views: PhotoViews, index: int, part: Part | None) -> Metho
     sweep = ComponentSweep(body).measure([edges.measured_from_nominal] if isinstance(edges, Move) else [])
     if isinstance(edges, NotMeasured) and isinstance(sweep, Move):
         edges = ComponentEdges(body).measure(sweep.measured_from_nominal)
+    if isinstance(edges, NotMeasured) and isinstance(sweep, NotMeasured) and not edges.is_unseen:
+        edges = _turned(body, edges)
     if isinstance(edges, NotMeasured) and is_gone(body):
         reason = "missing: the photos show the surface that it should stand on"
         return {
@@ -107,11 +112,26 @@ def measure_component(views: PhotoViews, index: int, part: Part | None) -> Metho
     return {"sweep": sweep, "edges": edges}
 
 
+def _turned(body: MeasuredComponent, failed: NotMeasured) -> Move | NotMeasured:
+    """The component by its edges, from places at which it is turned on what it stands on; ``failed`` if at none."""
+    normals = _contact(body).normals
+    if not len(normals):
+        return failed
+    axis = normals.mean(axis=0) / max(float(np.linalg.norm(normals.mean(axis=0))), 1e-9)
+    starts = (body.moved(np.eye(4), np.concatenate([np.deg2rad(angle) * axis, np.zeros(3)])) for angle in TURNS_DEG)
+    found = [one for one in (ComponentEdges(body).measure(start) for start in starts) if isinstance(one, Move)]
+    return max(found, key=lambda one: one.support, default=failed)
+
+
+def _contact(body: MeasuredComponent) -> Samples:
+    """Samples of the component's surface that touch other components."""
+    samples = sample_surface(body.shape, SAMPLE_SPACING_PX * body.px_mm, SAMPLES)
+    return samples.of(near_others(samples.points, body.views.model, body.index, 0.5))
+
+
 def is_gone(body: MeasuredComponent) -> bool:
     """Whether the photos show the surfaces of other components that this one would hide."""
-    model = body.views.model
-    samples = sample_surface(body.shape, SAMPLE_SPACING_PX * body.px_mm, SAMPLES)
-    contact = samples.of(near_others(samples.points, model, body.index, 0.5))
+    contact = _contact(body)
     if len(contact.points) < 10:
         return False
     # The surface below faces opposite to the component's own.

@@ -18,7 +18,7 @@ from arview.geometry import Array, apply
 from arview.measurement.photo.component import MeasuredComponent
 from arview.measurement.photo.fit import RigidFit, fit_rigid, move_rows
 from arview.measurement.photo.kernels import choose_views, sweep_scores, vote_shifts
-from arview.measurement.photo.options import JOINT_MM, UNDETERMINED_MM
+from arview.measurement.photo.options import UNDETERMINED_MM
 from arview.measurement.photo.patches import (
     cut_patches,
     face_normals,
@@ -310,7 +310,7 @@ class ComponentSweep:
     def __init__(self, body: MeasuredComponent) -> None:
         self.body, self.views = body, body.views
         samples = sample_surface(body.shape, SAMPLE_SPACING_PX * body.px_mm, SAMPLES)
-        apart = ~near_others(samples.points, self.views.model, body.index, JOINT_MM)
+        apart = ~near_others(samples.points, self.views.model, body.index, body.joint_mm)
         apart &= ~near_edges(samples.points, body.shape, SWEEP_EDGE_PX * body.px_mm)
         self.samples = samples.of(apart)
         self.patch_mm = PATCH_PX * body.px_mm
@@ -405,7 +405,7 @@ class ComponentSweep:
         """Patches on the component's surface, without what is near other components or sharp edges."""
         patches, is_on = cut_patches(self.samples, self._caster, self._faces, width, spacing_mm)
         points = patches[is_on]
-        apart = ~near_others(points, self.views.model, self.body.index, JOINT_MM)
+        apart = ~near_others(points, self.views.model, self.body.index, self.body.joint_mm)
         is_on[is_on] = apart & ~near_edges(points, self.body.shape, SWEEP_EDGE_PX * self.body.px_mm)
         return patches, is_on
 
