@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+
 import numpy as np
 
 from arview.cad import Model, Part, sample_surface
@@ -15,6 +17,8 @@ from arview.measurement.types import Method, Move
 
 HEIGHTS_MM, HEIGHT_SHARE = (8.0, 5.6, 4.0, 2.8, 2.0, 1.4, 1.0, 0.7, 0.5), 0.1
 """Heights above other components that are tried, and share of the surface that must be higher."""
+NEAR_JOINT_MM = 1.0
+"""The same where other edges do not determine all directions: most joints are bolted, clipped or riveted, not welded."""
 HEIGHT_SAMPLES = 600
 """Samples of a component by which its height is found."""
 
@@ -33,6 +37,7 @@ class MeasuredComponent:
         px_mm: size of a pixel at the component.
         free: (K,6) motions that leave its shape unchanged, see `free_directions`.
         joint_mm: see `joint_mm`.
+        uses_joints: whether edges at joints with other components are used, too.
     """
 
     def __init__(self, views: PhotoViews, index: int, part: Part | None) -> None:
@@ -45,6 +50,13 @@ class MeasuredComponent:
         self.px_mm = views.mm_per_px(self.center)
         self.free = free_directions(self.shape, part, self.center, self.radius_mm)
         self.joint_mm = joint_mm(views.model, index)
+        self.uses_joints = False
+
+    def with_joints(self) -> MeasuredComponent:
+        """The same component, measured by edges at its joints as well."""
+        other = copy.copy(self)
+        other.joint_mm, other.uses_joints = min(self.joint_mm, NEAR_JOINT_MM), True
+        return other
 
     def moved(self, place: Array, twist: Array) -> Array:
         """The place after a further twist (6,) about the point to which the place takes the centre."""

@@ -63,6 +63,11 @@ BLUR_PX = 1.0
 """Standard deviation of a step's blur: lens, sensor, smoothing, and the samples of a profile."""
 FLANKED_PX = 0.5
 """Systematic standard deviation where all edges have others beside them: half their gap."""
+SMALL_PX, SMALL_SIZES_PX = 0.15, (30.0, 90.0)
+"""The same of a small component, whose few edges lie all in the same light and on the same roundings, or of one measured
+by edges at its joints; and the diagonals between which it decreases to nothing."""
+WEAK_SUPPORT, WEAK_PX = 0.5, 3.0
+"""Support below which what hides the edges may have taken their place, and the standard deviation by the lack of it."""
 SYSTEMATIC_PX = 0.03
 """Standard deviation of a common shift of all edges of a component: chamfers, light."""
 
@@ -249,7 +254,10 @@ class ComponentEdges:
             reason = f"its edges are not seen where they should be: {100 * support:.0f} % more than by chance"
             return NotMeasured(self.body.shape.name, "edges", reason, support=support)
         by_poses = pose_gain(self.views, fit, edges.view[ok], found.pose_rows[ok])
-        systematic_px = float(np.hypot(SYSTEMATIC_PX, FLANKED_PX * flanked))
+        size_px = 2.0 * self.body.radius_mm / self.body.px_mm
+        small = 1.0 if self.body.uses_joints else np.interp(size_px, SMALL_SIZES_PX, (1.0, 0.0))
+        weak = max(WEAK_SUPPORT - support, 0.0)
+        systematic_px = float(np.linalg.norm([SYSTEMATIC_PX, FLANKED_PX * flanked, SMALL_PX * small, WEAK_PX * weak]))
         # Edges of one kind have steps of one kind beside them, so that they are all shifted the same way.
         merged = _RIVAL_HEIGHT_STD * fit.gain @ found.merged_mm[ok]
         return self.body.move("edges", fit, by_poses, place, systematic_px * self.body.px_mm, support, merged)

@@ -14,6 +14,7 @@ from arview.measurement.photo.patches import near_others
 from arview.measurement.photo.sweep import MIN_VIEWS, SAMPLE_SPACING_PX, SAMPLES, ComponentSweep, sweep_offsets
 from arview.measurement.photo.views import PhotoViews, load_views
 from arview.measurement.types import Method, Move, NotMeasured
+from arview.measurement.uncertainty.combine import agreements
 from arview.reconstruction import SparseModel
 
 ABSENT_SUPPORT = 0.1
@@ -25,6 +26,8 @@ MIN_CLEAR = 3
 GONE_SHARE = 0.6
 """A component is missing when more than this share of what it would hide is visible."""
 
+TRUSTED_SUPPORT = 0.6
+"""Share of a component's edges found from which a sweep that contradicts them is not used."""
 TURNS_DEG = (-2.5, 2.5, -5.0, 5.0, -8.0, 8.0)
 """Turns on its seat from which a component is sought that neither method finds near its place."""
 
@@ -96,7 +99,7 @@ def _absent_if_no_edges(found: MethodResults, results: Mapping[str, MethodResult
 def measure_component(views: PhotoViews, index: int, part: Part | None) -> MethodResults:
     """Measure one component by both methods; if the edges fail, check whether the component is missing."""
     body = MeasuredComponent(views, index, part)
-    edges = ComponentEdges(body).measure()
+    edges = _by_edges(body)
     # The place found by edges is one more start of the sweep; the sweep's result there remains independent.
     sweep = ComponentSweep(body).measure([edges.measured_from_nominal] if isinstance(edges, Move) else [])
     if isinstance(edges, NotMeasured) and isinstance(sweep, Move):
@@ -109,7 +112,31 @@ def measure_component(views: PhotoViews, index: int, part: Part | None) -> Metho
             "sweep": NotMeasured(body.shape.name, "sweep", reason, is_missing=True),
             "edges": NotMeasured(body.shape.name, "edges", reason, is_missing=True),
         }
-    return {"sweep": sweep, "edges": edges}
+    return {"sweep": _uncontradicted(sweep, edges), "edges": edges}
+
+
+def _uncontradicted(sweep: Move | NotMeasured, edges: Move | NotMeasured) -> Move | NotMeasured:
+    """The sweep, unless it contradicts well-supported edges that determine as much: gloss moves over a surface."""
+    if isinstance(sweep, NotMeasured) or isinstance(edges, NotMeasured):
+        return sweep
+    if edges.support < TRUSTED_SUPPORT or len(edges.undetermined) > len(sweep.undetermined):
+        return sweep
+    apart_mm = [pair.difference_mm for pair in agreements([sweep, edges]) if pair.is_contradiction]
+    if not apart_mm:
+        return sweep
+    reason = f"contradicts its edges, {100 * edges.support:.0f} % of which are seen: {apart_mm[0]:.2f} mm apart"
+    return NotMeasured(sweep.component, "sweep", reason)
+
+
+def _by_edges(body: MeasuredComponent) -> Move | NotMeasured:
+    """The component by its edges; by those at its joints, too, where the others leave directions undetermined."""
+    edges = ComponentEdges(body).measure()
+    count = 6 if isinstance(edges, NotMeasured) else len(edges.undetermined)
+    if count == len(body.free):
+        return edges
+    start = edges.measured_from_nominal if isinstance(edges, Move) else None
+    more = ComponentEdges(body.with_joints()).measure(start)
+    return more if isinstance(more, Move) and len(more.undetermined) < count else edges
 
 
 def _turned(body: MeasuredComponent, failed: NotMeasured) -> Move | NotMeasured:
