@@ -63,9 +63,9 @@ def noise_variance(residuals: Array) -> float:
     """Variance in px² of one coordinate of observations with residuals (K,2), as their robust adjustment has it.
 
     An M-estimate has the covariance of least squares times ``E[ψ²] / E[ψ']²`` (Huber, "Robust Statistics", 1981,
-    section 7.6). The adjuster's information weighs each observation by the derivative of its loss, Cauchy's, whose mean is the
-    third factor. So tails count by what they do to the result: neither fully, as in the standard deviation of the
-    residuals, nor not at all, as in their median.
+    section 7.6). The adjuster's information weighs each observation by the derivative of its loss, Cauchy's, whose mean
+    is the third factor. So tails count by what they do to the result: neither fully, as in the standard deviation of
+    the residuals, nor not at all, as in their median.
     """
     squares = np.sum(residuals**2, axis=1) / LOSS_PX**2
     weights = 1.0 / (1.0 + squares)

@@ -64,8 +64,8 @@ BLUR_PX = 1.0
 FLANKED_PX = 0.5
 """Systematic standard deviation where all edges have others beside them: half their gap."""
 SMALL_PX, SMALL_SIZES_PX = 0.15, (30.0, 90.0)
-"""The same of a small component, whose few edges lie all in the same light and on the same roundings, or of one measured
-by edges at its joints; and the diagonals between which it decreases to nothing."""
+"""The same of a small component, whose few edges lie all in the same light and on the same roundings, or of one
+measured by edges at its joints; and the diagonals between which it decreases to nothing."""
 WEAK_SUPPORT, WEAK_PX = 0.5, 3.0
 """Support below which what hides the edges may have taken their place, and the standard deviation by the lack of it."""
 SYSTEMATIC_PX = 0.03
