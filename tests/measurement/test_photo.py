@@ -13,6 +13,7 @@ from arview.cad.model import Component, Model, make_model
 from arview.errors import InputError
 from arview.geometry import Array, apply, exp_so3, log_so3, rigid
 from arview.measurement.photo import PhotoViews, fit_rim, measure_components_in_photos, sweep_offsets
+from arview.measurement.photo.component import joint_mm
 from arview.measurement.photo.views import views_of
 from arview.measurement.types import Method, Move, NotMeasured
 from helpers import photo_scene
@@ -163,6 +164,32 @@ def test_missing_without_texture() -> None:
         elsewhere = painted()["block_4"][method]
         assert isinstance(elsewhere, NotMeasured) and not elsewhere.is_missing
     assert all(isinstance(painted(is_there=False)[name]["edges"], Move) for name in BLOCKS[:3])
+
+
+def test_low_heads_are_measured_and_a_missing_one_is_named() -> None:
+    """Heads of ⌀12 × 2.6 mm, 17 px: lower than the distance from a seat within which edges usually are dropped."""
+    heads = {f"head_{k}": post(at, 6.0, 0.0, 2.6, 32) for k, at in enumerate(((-80, 0), (0, -80), (82, 5)), 1)}
+    rail = box((-60, -6, 0), (60, 4, 7))
+    parts = [Component(name, mesh[0], mesh[1].astype(np.int32)) for name, mesh in {**heads, "rail": rail}.items()]
+    nominal = make_model("bench", (*bench(1).components, *parts))
+    places: dict[str, Array | None] = {
+        "head_1": place_of(nominal, "head_1", (0.7, -0.5, 0.0), (0.0, 0.0, 0.0)),
+        "head_3": None,
+        "rail": place_of(nominal, "rail", (0.0, 0.0, 0.0), (0.0, 0.0, 5.0)),
+    }
+    views = views_on(nominal, displaced(nominal, places))
+    assert [joint_mm(nominal, nominal.index(name)) for name in ("head_1", "rail", "block_1")] == [1.0, 2.8, 4.0]
+    found = measure_components_in_photos(views, None, nominal, names=("head_1", "head_2", "head_3", "rail", *BLOCKS))
+    for name in ("head_1", "head_2"):
+        move = found[name]["edges"]
+        assert isinstance(move, Move) and move.support > 0.4
+        assert np.abs(errors(move, places.get(name, np.eye(4)))[0]).max() < 0.2
+    missing = found["head_3"]["edges"]
+    assert isinstance(missing, NotMeasured) and missing.is_missing
+    turned = found["rail"]["edges"]
+    assert isinstance(turned, Move)
+    mm, deg = errors(turned, places["rail"])
+    assert np.abs(mm).max() < 0.1 and np.abs(deg).max() < 0.2
 
 
 def test_thin_sheet_whose_narrow_face_is_not_seen() -> None:

@@ -51,6 +51,8 @@ MIN_DIRECTION = 0.2
 """Share of a direction's information that must agree for it to be determined."""
 MIN_SUPPORT = 0.25
 """Share of predicted points with a step at the fitted place, beyond chance."""
+SMALL_SUPPORT = 0.2
+"""The same for a small component, in addition: its few edges are found in any texture more easily."""
 FIRST_RIVAL_PX = 3.0
 """In the first rounds, points with another edge nearer beside them are left out."""
 RIVAL_PX = 2.0
@@ -250,12 +252,14 @@ class ComponentEdges:
         place = self.body.moved(before, fit.twist)
         support = self._support(edges, place)
         used = int(np.count_nonzero(fit.weights > 0.1))
-        if support < MIN_SUPPORT or used < MIN_POINTS or len(fit.undetermined) == 6:
+        size_px = 2.0 * self.body.radius_mm / self.body.px_mm
+        small = float(np.interp(size_px, SMALL_SIZES_PX, (1.0, 0.0)))
+        min_support = MIN_SUPPORT + SMALL_SUPPORT * small
+        if support < min_support or used < MIN_POINTS or len(fit.undetermined) == 6:
             reason = f"its edges are not seen where they should be: {100 * support:.0f} % more than by chance"
             return NotMeasured(self.body.shape.name, "edges", reason, support=support)
         by_poses = pose_gain(self.views, fit, edges.view[ok], found.pose_rows[ok])
-        size_px = 2.0 * self.body.radius_mm / self.body.px_mm
-        small = 1.0 if self.body.uses_joints else np.interp(size_px, SMALL_SIZES_PX, (1.0, 0.0))
+        small = 1.0 if self.body.uses_joints else small
         weak = max(WEAK_SUPPORT - support, 0.0)
         systematic_px = float(np.linalg.norm([SYSTEMATIC_PX, FLANKED_PX * flanked, SMALL_PX * small, WEAK_PX * weak]))
         # Edges of one kind have steps of one kind beside them, so that they are all shifted the same way.

@@ -19,6 +19,10 @@ from arview.reconstruction import SparseModel
 
 ABSENT_SUPPORT = 0.1
 """Share of a component's edges found below which nothing of it is there."""
+SOME_SUPPORT = 0.2
+"""Share from which something of it is there, whatever the surface below seems to show."""
+MIN_HEIGHT_PX = 4.0
+"""Height of a component below which the surface that it stands on is not told from its own."""
 CLEAR_SUPPORT = 0.5
 """Share of other components' edges found for the photos to show what is there."""
 MIN_CLEAR = 3
@@ -28,6 +32,8 @@ GONE_SHARE = 0.6
 
 TRUSTED_SUPPORT = 0.6
 """Share of a component's edges found from which a sweep that contradicts them is not used."""
+TURNED_SUPPORT = 0.5
+"""Share of its edges that must be found where a component is turned: the best of several places fits by chance more."""
 TURNS_DEG = (-2.5, 2.5, -5.0, 5.0, -8.0, 8.0)
 """Turns on its seat from which a component is sought that neither method finds near its place."""
 
@@ -106,7 +112,7 @@ def measure_component(views: PhotoViews, index: int, part: Part | None) -> Metho
         edges = ComponentEdges(body).measure(sweep.measured_from_nominal)
     if isinstance(edges, NotMeasured) and isinstance(sweep, NotMeasured) and not edges.is_unseen:
         edges = _turned(body, edges)
-    if isinstance(edges, NotMeasured) and is_gone(body):
+    if isinstance(edges, NotMeasured) and (edges.support or 0.0) < SOME_SUPPORT and is_gone(body):
         reason = "missing: the photos show the surface that it should stand on"
         return {
             "sweep": NotMeasured(body.shape.name, "sweep", reason, is_missing=True),
@@ -136,7 +142,9 @@ def _by_edges(body: MeasuredComponent) -> Move | NotMeasured:
         return edges
     start = edges.measured_from_nominal if isinstance(edges, Move) else None
     more = ComponentEdges(body.with_joints()).measure(start)
-    return more if isinstance(more, Move) and len(more.undetermined) < count else edges
+    return (
+        more if isinstance(more, Move) and more.support >= TURNED_SUPPORT and len(more.undetermined) < count else edges
+    )
 
 
 def _turned(body: MeasuredComponent, failed: NotMeasured) -> Move | NotMeasured:
@@ -146,7 +154,8 @@ def _turned(body: MeasuredComponent, failed: NotMeasured) -> Move | NotMeasured:
         return failed
     axis = normals.mean(axis=0) / max(float(np.linalg.norm(normals.mean(axis=0))), 1e-9)
     starts = (body.moved(np.eye(4), np.concatenate([np.deg2rad(angle) * axis, np.zeros(3)])) for angle in TURNS_DEG)
-    found = [one for one in (ComponentEdges(body).measure(start) for start in starts) if isinstance(one, Move)]
+    measured = [ComponentEdges(body).measure(start) for start in starts]
+    found = [one for one in measured if isinstance(one, Move) and one.support >= TURNED_SUPPORT]
     return max(found, key=lambda one: one.support, default=failed)
 
 
@@ -159,7 +168,8 @@ def _contact(body: MeasuredComponent) -> Samples:
 def is_gone(body: MeasuredComponent) -> bool:
     """Whether the photos show the surfaces of other components that this one would hide."""
     contact = _contact(body)
-    if len(contact.points) < 10:
+    # A component that is hardly higher than the search is exact looks like the bare surface.
+    if len(contact.points) < 10 or 2.0 * body.joint_mm < MIN_HEIGHT_PX * body.px_mm:
         return False
     # The surface below faces opposite to the component's own.
     below = Samples(contact.points, -contact.normals)
