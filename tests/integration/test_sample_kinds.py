@@ -230,7 +230,7 @@ def test_sets_for_the_coverage():
     make_sets = loaded(TOOLS / "benchmarks" / "make_sets.py")
     sets = make_sets.all_sets()
     assert len({one.name for one in sets}) == len({one.seed for one in sets}) == len(sets) >= 20
-    components = {"plate": 16, "manifold": 14, "panel": 22}
+    components = {"plate": 16, "manifold": 14, "panel": 22, "cabinet": 19}
     assert sum(components[one.kind] for one in sets) >= 300
     assert {one.light for one in sets} == set(make_sets.LIGHTS)
     assert min(one.photos for one in sets) == 8 and max(one.photos for one in sets) == 48

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Render the photo sets on which the coverage of U is judged: three kinds of part, lights, photos, layouts, finishes.
+"""Render the photo sets on which the coverage of U is judged: four kinds of part, lights, photos, layouts, finishes.
 
     make_sets.py -o sets/ --python /tmp/samples-venv/bin/python     all of them; resumes where it was stopped
     make_sets.py --list                                             what would be made
@@ -22,10 +22,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 SAMPLES = Path(__file__).resolve().parents[2] / "samples"
-KINDS = ("plate", "manifold", "panel")
+KINDS = ("plate", "manifold", "panel", "cabinet")
 LIGHTS = ("workshop", "hard-sun", "mixed", "dim")
-OWN_FINISH = {"plate": "steel", "manifold": "cast", "panel": "paint"}
-WORN_FINISH = {"plate": "paint", "manifold": "rust", "panel": "chrome"}
+OWN_FINISH = {"plate": "steel", "manifold": "cast", "panel": "paint", "cabinet": "paint"}
+WORN_FINISH = {"plate": "paint", "manifold": "rust", "panel": "chrome", "cabinet": "rust"}
 DESIGNS = (
     ("workshop", 24, "ring", False),
     ("hard-sun", 16, "ring", False),
