@@ -160,8 +160,8 @@ def test_combination_by_inverse_variance_and_disagreement() -> None:
 
 
 def test_specs() -> None:
-    assert parse_board("charuco:8x6:30:22:DICT_5X5_100") == Board(True, 8, 6, 30.0, 22.0, "DICT_5X5_100")
-    assert parse_board("grid:5x7:30:6:apriltag36h11") == Board(False, 5, 7, 36.0, 30.0, "DICT_APRILTAG_36h11")
+    assert parse_board("charuco:8x6:30:22:DICT_5X5_100") == Board("charuco", 8, 6, 30.0, 22.0, "DICT_5X5_100")
+    assert parse_board("grid:5x7:30:6:apriltag36h11") == Board("grid", 5, 7, 36.0, 30.0, "DICT_APRILTAG_36h11")
     assert parse_tags("tag36h11:20").side_mm == 20.0
     bar = parse_scale_bar("4x4_50:3:7:500.02")
     assert (bar.dictionary, bar.first, bar.second, bar.length_mm) == ("DICT_4X4_50", 3, 7, 500.02)

@@ -60,6 +60,14 @@ class ScaleSources:
     bars: tuple[ScaleBar, ...] = ()
     rig: Rig | None = None
 
+    def __post_init__(self) -> None:
+        for board in self.boards:
+            if not board.is_coded:
+                raise InputError(
+                    f"{board}: nothing tells its corners apart in several photos; for the scale give a ChArUco board, a"
+                    " grid of markers or tags"
+                )
+
 
 def parse_scale_bar(text: str, default_dictionary: str = DEFAULT_DICTIONARY) -> ScaleBar:
     """The scale bar described on the command line, see BAR_FORM. Raises InputError."""
