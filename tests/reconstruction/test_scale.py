@@ -289,6 +289,27 @@ def test_boards_tags_and_bars_through_a_lens() -> None:
 
 
 @pytest.mark.slow
+def test_a_layout_of_tags_through_a_lens(tmp_path: Path) -> None:
+    poses, pictures = target_scene()
+    square = np.array([[0.0, 0.0, 0.0], [24.0, 0.0, 0.0], [24.0, 24.0, 0.0], [0.0, 24.0, 0.0]])
+    places = {3: [40.0, 170.0, 0.0], 7: [190.0, 170.0, 0.0], 9: [230.0, 50.0, 0.0]}
+    path = tmp_path / "layout.json"
+    corners = {str(index): (square + place).tolist() for index, place in places.items()}
+    path.write_text(json.dumps({"tag_layout": [{"corners_mm": corners, "std_mm": 0.005}]}))
+    result = find_scale(sparse_of(poses, LENS), None, load_scale_file(path), read=reader(pictures))
+    (evidence,) = result.evidence
+    assert evidence.kind == "tag_layout" and "12 corners of 3 tags over" in evidence.detail and not result.warnings
+    assert abs(evidence.mm_per_unit / TRUTH.scale - 1.0) < 2.0 * evidence.std < 1e-3
+    again = ScaleResult.from_provenance(json.loads(json.dumps(result.provenance())))
+    assert again.evidence == result.evidence
+
+
+def test_boards_without_markers_give_no_scale() -> None:
+    with pytest.raises(InputError, match="checkerboard 9×6, 25 mm: nothing tells its corners apart"):
+        ScaleSources(boards=(parse_board("checkerboard:9x6:25"),))
+
+
+@pytest.mark.slow
 def test_wrong_board_size_is_noticed_and_absent_targets_are_named() -> None:
     poses, pictures = target_scene()
     sources = ScaleSources(
