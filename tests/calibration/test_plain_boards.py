@@ -150,7 +150,7 @@ def test_a_folder_of_photos(board: Board, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_large_pictures_light_circles_and_swapped_counts() -> None:
+def test_large_and_dim_pictures_light_circles_and_swapped_counts() -> None:
     rng = np.random.default_rng(0)
     one = poses_of(CHECKERBOARD, 1, seed=3)[0]
     large = Camera(1800, 1349, LENS.fx * 2.8, LENS.fy * 2.8, LENS.cx * 2.8, LENS.cy * 2.8, LENS.dist)
@@ -161,6 +161,10 @@ def test_large_pictures_light_circles_and_swapped_counts() -> None:
     light = PlainBoardFinder(CIRCLES).find("light", 255 - photograph(CIRCLES, LENS, one, rng))
     assert isinstance(light, BoardView)
     assert light.radius_mm == pytest.approx(6.0, rel=0.03)
+    dim = photograph(CHECKERBOARD, LENS, one, rng, noise=6.0, ground=25.0) * 0.4  # before a dark, noisy wall
+    seen_dim = PlainBoardFinder(CHECKERBOARD).find("dim", dim.astype(np.uint8))
+    assert isinstance(seen_dim, BoardView)
+    assert rms_to(seen_dim.pixels, truth(CHECKERBOARD, one)) < 0.25
     picture = photograph(CHECKERBOARD, LENS, one, rng)
     swapped = PlainBoardFinder(parse_board("checkerboard:6x9:24")).find("swapped", picture)
     assert isinstance(swapped, BoardView)

@@ -74,7 +74,7 @@ class PlainBoardFinder:
     def _corners(self, gray: NDArray[np.uint8], small: NDArray[np.uint8], factor: Array) -> Array | None:
         """Inner corners (N,2) px of the whole checkerboard in the full picture."""
         size = (self.board.columns, self.board.rows)
-        is_found, corners = cv2.findChessboardCornersSB(small, size, flags=cv2.CALIB_CB_NORMALIZE_IMAGE)
+        is_found, corners = cv2.findChessboardCornersSB(small, size)
         if not is_found:
             self._seen, corners = _any_checkerboard(small)  # which may find it all the same
             if self._seen not in (size, size[::-1]):
@@ -192,8 +192,7 @@ def checkerboard_in(gray: NDArray[np.uint8]) -> tuple[int, int] | None:
 
 def _any_checkerboard(small: NDArray[np.uint8]) -> tuple[tuple[int, int] | None, Array]:
     """Columns and rows of a checkerboard of unknown size, None if there is none, and its corners (N,2) px."""
-    flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER
-    is_found, corners, kinds = cv2.findChessboardCornersSBWithMeta(small, FIRST_SIZE, flags)
+    is_found, corners, kinds = cv2.findChessboardCornersSBWithMeta(small, FIRST_SIZE, cv2.CALIB_CB_LARGER)
     rows, columns = np.asarray(kinds).shape[:2] if is_found and kinds is not None else (0, 0)
     size = (int(columns), int(rows)) if columns * rows >= MIN_UNKNOWN else None
     return size, np.asarray(corners, dtype=np.float64).reshape(-1, 2) if size else np.zeros((0, 2))
