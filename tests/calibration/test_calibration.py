@@ -14,12 +14,13 @@ import pytest
 from click.testing import CliRunner
 from PIL import Image
 
+from arview.calibration.board_view import BoardView
 from arview.calibration.choose import ChoiceOptions, choose_views
 from arview.calibration.plot import draw
 from arview.calibration.run import calibrate, record_of
 from arview.calibration.solve import Solution, picture_grid, pixel_difference, pixel_uncertainty, solve
 from arview.calibration.verdict import Grade, assess
-from arview.calibration.views import BoardFinder, BoardView
+from arview.calibration.views import BoardFinder
 from arview.camera import Camera
 from arview.camera.exif import PhotoExif, read_exif
 from arview.camera.profiles import (
@@ -271,7 +272,7 @@ def test_another_size_of_squares_gives_the_same_camera(pictures: list[np.ndarray
 
 
 def test_boards_of_old_opencv_are_recognised() -> None:
-    board = Board(True, 6, 8, 25.0, 18.0, "DICT_5X5_100")
+    board = Board("charuco", 6, 8, 25.0, 18.0, "DICT_5X5_100")
     drawn = cv_board(board)
     drawn.setLegacyPattern(True)
     gray = cv2.copyMakeBorder(drawn.generateImage((360, 480)), 60, 60, 60, 60, cv2.BORDER_CONSTANT, value=255)

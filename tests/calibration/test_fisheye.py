@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from arview.calibration.board_view import BoardView
 from arview.calibration.lens_comparison import compare_lenses
 from arview.calibration.projection import CalibratedLens, fisheye_camera, intrinsics_of, project
 from arview.calibration.run import calibrate
 from arview.calibration.solve import picture_grid, pixel_difference, pixel_uncertainty, seen_by_lens, solve
 from arview.calibration.verdict import Grade, assess
-from arview.calibration.views import BoardView
 from arview.camera import Camera
 from arview.camera.lens import LensDistortion, LensModel
 from arview.camera.read import load_camera

@@ -1,4 +1,4 @@
-"""Pictures of a ChArUco board by a known camera: exact perspective and distortion, area-averaged, blurred, noisy."""
+"""Pictures of a board by a known camera: exact perspective and distortion, area-averaged, blurred, noisy."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from arview.calibration.plain_boards import points_of
 from arview.camera import Camera
 from arview.camera.lens import LensDistortion
 from arview.fiducials.board import Board, parse_board
@@ -23,8 +24,10 @@ _SUPER = 2
 
 @cache
 def _texture(board: Board) -> tuple[NDArray[np.uint8], float]:
-    """The board's plane at _PX_PER_MM with a white margin of some mm."""
+    """The board's plane at _PX_PER_MM, and how many mm of it are left of and above the board's origin."""
     margin = 12.0
+    if not board.is_coded:
+        return _plain_texture(board, margin)
     size = (round((board.rows * board.cell_mm + 2 * margin) * _PX_PER_MM),
             round((board.columns * board.cell_mm + 2 * margin) * _PX_PER_MM))  # fmt: skip
     picture = np.full(size, 235, np.uint8)
@@ -34,6 +37,28 @@ def _texture(board: Board) -> tuple[NDArray[np.uint8], float]:
             c, d = round((top + margin) * _PX_PER_MM), round((top + height + margin) * _PX_PER_MM)
             picture[c:d, a:b] = gray
     return picture, margin
+
+
+def _plain_texture(board: Board, margin: float) -> tuple[NDArray[np.uint8], float]:
+    """A checkerboard, or circles of half their distance, whose first corner or circle is at the origin."""
+    points, cell = points_of(board)[:, :2], board.cell_mm
+    border = margin + cell
+    width, height = (round((side + 2 * border) * _PX_PER_MM) for side in points.max(axis=0))
+    y, x = np.mgrid[:height, :width]
+    x, y = (x + 0.5) / _PX_PER_MM - border, (y + 0.5) / _PX_PER_MM - border
+    if board.kind == "checkerboard":
+        inside = (x >= -cell) & (y >= -cell) & (x < board.columns * cell) & (y < board.rows * cell)
+        is_dark = inside & ((np.floor(x / cell) + np.floor(y / cell)) % 2 == 0)
+    else:
+        is_dark = np.zeros((height, width), dtype=bool)
+        for a, b in points:
+            is_dark |= np.hypot(x - a, y - b) <= circle_radius_mm(board)
+    return np.where(is_dark, 20, 235).astype(np.uint8), border
+
+
+def circle_radius_mm(board: Board) -> float:
+    """Radius of the circles that are drawn: a quarter of the distance of two in a row."""
+    return (0.5 if board.kind == "acircles" else 0.25) * board.cell_mm
 
 
 @cache
@@ -96,6 +121,8 @@ def pose(
 ) -> Array:
     """``cam_from_board`` of a random view: its middle up to ``aside`` of the picture off the centre."""
     middle = 0.5 * np.array([board.columns * board.cell_mm, board.rows * board.cell_mm, 0.0])
+    if not board.is_coded:
+        middle = 0.5 * points_of(board).max(axis=0)
     tilt, azimuth, roll = np.deg2rad([rng.uniform(*tilt_deg), rng.uniform(0, 360), rng.uniform(-20, 20)])
     from_board = exp_so3([0, 0, roll]) @ exp_so3(tilt * np.array([np.cos(azimuth), np.sin(azimuth), 0.0]))
     depth = camera.fx * 2.0 * middle[0] / (rng.uniform(*fill) * camera.width)

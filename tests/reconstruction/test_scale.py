@@ -160,8 +160,8 @@ def test_combination_by_inverse_variance_and_disagreement() -> None:
 
 
 def test_specs() -> None:
-    assert parse_board("charuco:8x6:30:22:DICT_5X5_100") == Board(True, 8, 6, 30.0, 22.0, "DICT_5X5_100")
-    assert parse_board("grid:5x7:30:6:apriltag36h11") == Board(False, 5, 7, 36.0, 30.0, "DICT_APRILTAG_36h11")
+    assert parse_board("charuco:8x6:30:22:DICT_5X5_100") == Board("charuco", 8, 6, 30.0, 22.0, "DICT_5X5_100")
+    assert parse_board("grid:5x7:30:6:apriltag36h11") == Board("grid", 5, 7, 36.0, 30.0, "DICT_APRILTAG_36h11")
     assert parse_tags("tag36h11:20").side_mm == 20.0
     bar = parse_scale_bar("4x4_50:3:7:500.02")
     assert (bar.dictionary, bar.first, bar.second, bar.length_mm) == ("DICT_4X4_50", 3, 7, 500.02)
@@ -286,6 +286,27 @@ def test_boards_tags_and_bars_through_a_lens() -> None:
     assert result.scale_std is not None and 1e-4 < result.scale_std < 4e-4
     assert result.model_from_scan is None and result.why_no_frame == "no part was given"
     assert json.loads(json.dumps(result.provenance()))["evidence"][0]["kind"] == "board"
+
+
+@pytest.mark.slow
+def test_a_layout_of_tags_through_a_lens(tmp_path: Path) -> None:
+    poses, pictures = target_scene()
+    square = np.array([[0.0, 0.0, 0.0], [24.0, 0.0, 0.0], [24.0, 24.0, 0.0], [0.0, 24.0, 0.0]])
+    places = {3: [40.0, 170.0, 0.0], 7: [190.0, 170.0, 0.0], 9: [230.0, 50.0, 0.0]}
+    path = tmp_path / "layout.json"
+    corners = {str(index): (square + place).tolist() for index, place in places.items()}
+    path.write_text(json.dumps({"tag_layout": [{"corners_mm": corners, "std_mm": 0.005}]}))
+    result = find_scale(sparse_of(poses, LENS), None, load_scale_file(path), read=reader(pictures))
+    (evidence,) = result.evidence
+    assert evidence.kind == "tag_layout" and "12 corners of 3 tags over" in evidence.detail and not result.warnings
+    assert abs(evidence.mm_per_unit / TRUTH.scale - 1.0) < 2.0 * evidence.std < 1e-3
+    again = ScaleResult.from_provenance(json.loads(json.dumps(result.provenance())))
+    assert again.evidence == result.evidence
+
+
+def test_boards_without_markers_give_no_scale() -> None:
+    with pytest.raises(InputError, match="checkerboard 9×6, 25 mm: nothing tells its corners apart"):
+        ScaleSources(boards=(parse_board("checkerboard:9x6:25"),))
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""Lens calibration from pictures of a ChArUco board: finding the board, the camera, its uncertainty and a verdict."""
+"""Lens calibration from pictures of a board: finding the board, the camera, its uncertainty and a verdict."""
 
 from typing import TYPE_CHECKING
 

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from arview.calibration.board_view import BoardView
 from arview.calibration.projection import PARAMETERS_OF, CalibratedLens, intrinsics_of, pose_of_board
 from arview.calibration.solve import MIN_VIEWS, information, solve
-from arview.calibration.views import BoardView
 from arview.camera import Camera
 from arview.errors import InputError
 from arview.geometry import Array

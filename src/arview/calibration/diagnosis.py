@@ -1,4 +1,4 @@
-"""Why no picture shows the board: another dictionary, another layout, or no markers at all."""
+"""Why no picture shows the board: another dictionary, another layout, another kind of board, or nothing at all."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from arview.calibration.plain_boards import checkerboard_in
 from arview.fiducials import Board, cv_board
 from arview.geometry import Array
 
@@ -34,7 +35,7 @@ MarkerDetections = tuple[Array, NDArray[np.int64]]
 
 
 def diagnose_missing_board(
-    board: Board, detections: Sequence[MarkerDetections], picture_count: int, pictures: Iterable[NDArray[np.uint8]]
+    board: Board, detections: Sequence[MarkerDetections], picture_count: int, pictures: Sequence[NDArray[np.uint8]]
 ) -> str:
     """Explain why no picture shows the board, and say what to do.
 
@@ -63,8 +64,50 @@ def diagnose_missing_board(
     other = _other_dictionary(pictures)
     if other is not None:
         return f"no marker of {board.dictionary} was found, but some of {other}; give the board in the pictures"
-    count = f"{picture_count} picture{'s' if picture_count > 1 else ''}"
-    return f"no marker of the board was found in any of {count}; it must be whole, in focus and fill half of it"
+    seen = Counter(max(size, size[::-1]) for gray in pictures if (size := checkerboard_in(gray)) is not None)
+    if seen:
+        (columns, rows), _ = seen.most_common(1)[0]
+        return (
+            f"a checkerboard without markers is seen, with {columns}×{rows} inner corners if that is all of it; give it"
+            f" as --board checkerboard:{columns}x{rows}:SQUARE_MM"
+        )
+    return (
+        f"no marker of the board was found in any of {_count(picture_count)}; it must be in focus and fill half of it"
+    )
+
+
+def diagnose_missing_plain_board(
+    board: Board,
+    sizes_seen: Counter[tuple[int, int]],
+    picture_count: int,
+    pictures: Iterable[NDArray[np.uint8]],
+) -> str:
+    """Explain why no picture shows a board without markers, and say what to do.
+
+    Args:
+        board: the board that was searched for.
+        sizes_seen: columns and rows of the checkerboards that were seen instead.
+        picture_count: number of pictures searched.
+        pictures: some of them, grey (H,W) uint8, in which markers are searched for.
+    """
+    dictionary = _other_dictionary(pictures)
+    if dictionary is not None:
+        return f"markers of {dictionary} are seen; give the board as --board charuco:… with what is printed on it"
+    if sizes_seen:
+        (columns, rows), times = sizes_seen.most_common(1)[0]
+        return (
+            f"a checkerboard of {columns}×{rows} inner corners is seen in {times} of {_count(picture_count)}, nowhere"
+            f" {board.columns}×{board.rows}; correct --board (one fewer than squares), or show the whole board"
+        )
+    what = "inner corners" if board.kind == "checkerboard" else "circles"
+    return (
+        f"no {board} with all its {what} was found in any of {_count(picture_count)}; it must be whole, with a light"
+        " margin, in focus and fill half of the picture"
+    )
+
+
+def _count(pictures: int) -> str:
+    return f"{pictures} picture{'s' if pictures > 1 else ''}"
 
 
 def _columns_that_fit(board: Board, detections: Sequence[MarkerDetections]) -> int | None:

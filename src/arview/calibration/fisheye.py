@@ -10,8 +10,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from arview.calibration.board_view import BoardView
 from arview.calibration.projection import fisheye_camera, intrinsics_of, pose_of_board, project
-from arview.calibration.views import BoardView
 from arview.camera import Camera
 from arview.errors import InputError
 from arview.geometry import Array, exp_so3

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from arview.calibration.board_view import BoardView
 from arview.calibration.projection import CalibratedLens
 from arview.calibration.solve import adjust
-from arview.calibration.views import BoardView
 from arview.errors import InputError
 
 PERCENTILE = 90.0

@@ -10,12 +10,14 @@ from typing import Any
 
 import numpy as np
 
+from arview.calibration.board_view import BoardView
 from arview.calibration.choose import ChoiceOptions, choose_views
 from arview.calibration.lens_comparison import LensComparison, compare_lenses
+from arview.calibration.plain_boards import with_centres
 from arview.calibration.projection import CalibratedLens, lens_of
 from arview.calibration.solve import MIN_VIEWS, K, Solution, solve
 from arview.calibration.verdict import CalibrationVerdict, assess
-from arview.calibration.views import BoardSightings, BoardView, find_views
+from arview.calibration.views import BoardSightings, find_views
 from arview.camera import Camera, lens_record
 from arview.core.progress import StepProgress
 from arview.errors import InputError
@@ -61,7 +63,7 @@ def calibrate(
     progress: StepProgress | None = None,
     lens: CalibratedLens = CalibratedLens.BROWN,
 ) -> Calibration:
-    """Calibrate a camera from photos, or one video, of a ChArUco board.
+    """Calibrate a camera from photos, or one video, of a ChArUco board, a checkerboard or a grid of circles.
 
     Args:
         sources: photo files, folders, globs; or one video.
@@ -85,6 +87,9 @@ def calibrate(
     try:
         views, left_out = choose_views(views, *size, choice, lens)
         solution = solve(views, *size, lens)
+        if any(view.radius_mm > 0.0 for view in views):
+            views = [with_centres(view, solution.camera) for view in views]
+            solution = solve(views, *size, lens)
     except InputError as error:
         advice = compare_lenses(views[: ChoiceOptions.max_views], *size, lens).advice
         raise InputError(f"{sightings.label}: {error}{f'; {advice}' if advice else ''}") from error

@@ -15,9 +15,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from arview.calibration.board_view import MIN_CORNERS, BoardView
 from arview.calibration.fisheye import adjust_fisheye
 from arview.calibration.projection import PARAMETERS_OF, CalibratedLens, lens_of, project
-from arview.calibration.views import MIN_CORNERS, BoardView
 from arview.camera import MAX_HALF_ANGLE_DEG, Camera
 from arview.core.fits import without_span
 from arview.errors import InputError

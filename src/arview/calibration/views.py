@@ -1,6 +1,7 @@
-"""Pictures of a ChArUco board: from photos or a video to corners, with the accuracy to expect of each picture.
+"""Pictures of a board: from photos or a video to corners, with the accuracy to expect of each picture.
 
-Corners are found by OpenCV's ChArUco detector (Garrido-Jurado et al. 2014) and refined where the squares meet. Pictures
+Corners are found by OpenCV's ChArUco detector (Garrido-Jurado et al. 2014) and refined where the squares meet; boards
+without markers are found by `arview.calibration.plain_boards`. Pictures
 are used as the sensor recorded them, before the rotation that makes them upright: portrait and landscape photos of one
 phone calibrate one camera, which is what `load_camera` expects.
 """
@@ -16,48 +17,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.calibration.diagnosis import diagnose_missing_board
+from arview.calibration.board_view import MIN_CORNERS, BoardView, blur_of
+from arview.calibration.diagnosis import diagnose_missing_board, diagnose_missing_plain_board
+from arview.calibration.plain_boards import PlainBoardFinder
 from arview.camera import HEIF_SUFFIXES, PHOTO_SUFFIXES, PhotoExif
 from arview.core.progress import StepProgress
 from arview.errors import InputError
 from arview.fiducials import Board, cv_board
 from arview.geometry import Array
 
-MIN_CORNERS = 8
-"""Pictures with fewer corners contain little information and are easily wrong."""
 _FRAMES_PER_S = 5.0
 """Frames of a video that are searched per second; a hand-held camera hardly moves in between."""
 _MAX_FRAMES = 400
 """Frames of a video that are searched at most."""
-_SHUTTER_S = 0.02
-"""Readout time of a phone's sensor (rolling shutter), which distorts moving objects."""
-
-
-@dataclass(frozen=True)
-class BoardView:
-    """The corners of the board in one picture.
-
-    Attributes:
-        name: of the photo, or ``frame N``.
-        ids: (N,) numbers of the corners.
-        points_in_board: (N,3) mm, z = 0.
-        pixels: (N,2) in the sensor's picture, integers at pixel centres.
-        blur_px: spread of edges on the board (Gaussian sigma), NaN when unknown.
-        speed_px_s: speed of the board in the picture; 0 for photos.
-    """
-
-    name: str
-    ids: NDArray[np.int64]
-    points_in_board: Array
-    pixels: Array
-    blur_px: float = float("nan")
-    speed_px_s: float = 0.0
-
-    @property
-    def sigma_px(self) -> float:
-        """Expected standard deviation of its corners: noise, blur beyond the usual, and motion during readout."""
-        blur = max(0.0, (1.0 if np.isnan(self.blur_px) else self.blur_px) - 1.0)
-        return float(np.linalg.norm([0.1, 0.1 * blur, 0.05 * _SHUTTER_S * self.speed_px_s]))
 
 
 @dataclass(frozen=True)
@@ -88,7 +60,7 @@ class BoardSightings:
 
 @dataclass
 class BoardFinder:
-    """Finds the corners of one board in grey pictures; boards of OpenCV before 4.6 (legacy pattern) are recognised."""
+    """Finds the corners of one ChArUco board in grey pictures, also of OpenCV before 4.6 (legacy pattern)."""
 
     board: Board
     markers_seen: list[tuple[Array, NDArray[np.int64]]] = field(default_factory=list)
@@ -98,7 +70,10 @@ class BoardFinder:
         import cv2
 
         if not self.board.is_charuco:
-            raise InputError(f"{self.board}: calibration needs a ChArUco board (`arview calibrate board` prints one)")
+            raise InputError(
+                f"{self.board}: calibration needs a ChArUco board (`arview calibrate board` prints one), a"
+                " checkerboard or a grid of circles"
+            )
         parameters = cv2.aruco.DetectorParameters()
         parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
         self._parameters = parameters
@@ -117,7 +92,7 @@ class BoardFinder:
                 pixels = np.asarray(corners, dtype=np.float64).reshape(-1, 2)
                 if detector.getBoard().checkCharucoCornersCollinear(np.asarray(ids)):
                     return "shows only one line of the board's corners"
-                return BoardView(name, number, points[number], pixels, _blur_px(gray, pixels))
+                return BoardView(name, number, points[number], pixels, blur_of(gray, pixels))
         found = 0 if marker_ids is None else len(marker_ids)
         if found == 0:
             return "shows no marker of the board"
@@ -151,7 +126,7 @@ def find_views(sources: Sequence[str | Path], board: Board, progress: StepProgre
         InputError: no source can be read, no camera took more than half of the pictures, or none of them shows the
             board; the message says what was found instead.
     """
-    finder = BoardFinder(board)
+    finder = BoardFinder(board) if board.is_coded else PlainBoardFinder(board)
     if not sources:
         raise InputError("expected photos of the board, or a video of it")
     if len(sources) == 1 and _is_video(Path(sources[0])):
@@ -159,7 +134,11 @@ def find_views(sources: Sequence[str | Path], board: Board, progress: StepProgre
     else:
         sightings = _views_of_photos(sources, finder, progress)
     if not sightings.views:
-        reason = diagnose_missing_board(board, finder.markers_seen, sightings.searched, _some_pictures(sources))
+        pictures, searched = _some_pictures(sources), sightings.searched
+        if isinstance(finder, PlainBoardFinder):
+            reason = diagnose_missing_plain_board(board, finder.sizes_seen, searched, pictures)
+        else:
+            reason = diagnose_missing_board(board, finder.markers_seen, searched, list(pictures))
         raise InputError(f"{sightings.label}: {reason}")
     return sightings
 
@@ -168,7 +147,7 @@ def find_views(sources: Sequence[str | Path], board: Board, progress: StepProgre
 
 
 def _views_of_photos(
-    sources: Sequence[str | Path], finder: BoardFinder, progress: StepProgress | None
+    sources: Sequence[str | Path], finder: BoardFinder | PlainBoardFinder, progress: StepProgress | None
 ) -> BoardSightings:
     """Search for the board in photos; those of another lens than most are left out."""
     from arview.reconstruction import photo_paths
@@ -258,7 +237,7 @@ def _sensor_size(exif: PhotoExif) -> tuple[int, int]:
     return (height, width) if exif.quarter_turns_clockwise % 2 else (width, height)
 
 
-def _view_of_photo(path: Path, name: str, turns: int, finder: BoardFinder) -> BoardView | str:
+def _view_of_photo(path: Path, name: str, turns: int, finder: BoardFinder | PlainBoardFinder) -> BoardView | str:
     """The view of one photo, or the reason why there is none."""
     import cv2
 
@@ -280,7 +259,9 @@ def _is_video(path: Path) -> bool:
     return path.is_file() and path.suffix.lower() not in PHOTO_SUFFIXES | HEIF_SUFFIXES
 
 
-def _views_of_video(path: Path, finder: BoardFinder, progress: StepProgress | None) -> BoardSightings:
+def _views_of_video(
+    path: Path, finder: BoardFinder | PlainBoardFinder, progress: StepProgress | None
+) -> BoardSightings:
     """Search for the board in the frames of a video."""
     import cv2
 
@@ -332,19 +313,7 @@ def _speed_px_s(before: BoardView | None, now: BoardView, seconds: float) -> flo
 # --- both --------------------------------------------------------------------------------------------------
 
 
-def _blur_px(gray: NDArray[np.uint8], pixels: Array) -> float:
-    """Edge spread of the part of the picture that contains the corners; NaN if it is small."""
-    from arview.reconstruction import blur_and_texture
-
-    height, width = gray.shape
-    low = np.maximum(np.floor(pixels.min(axis=0)).astype(int), 0)
-    high = np.minimum(np.ceil(pixels.max(axis=0)).astype(int) + 1, (width, height))
-    if min(high - low) < 40:
-        return float("nan")
-    return blur_and_texture(np.ascontiguousarray(gray[low[1] : high[1], low[0] : high[0]]))[0]
-
-
-def _some_pictures(sources: Sequence[str | Path], count: int = 3) -> Iterator[NDArray[np.uint8]]:
+def _some_pictures(sources: Sequence[str | Path], count: int = 5) -> Iterator[NDArray[np.uint8]]:
     """About ``count`` grey pictures of the sources, for the diagnosis."""
     import cv2
 

@@ -30,7 +30,7 @@ class _WithDefault(Group):
 
 @main.group(
     cls=_WithDefault,
-    short_help="Calibrate a camera from pictures of a ChArUco board.",
+    short_help="Calibrate a camera from pictures of a board.",
     epilog="""\b
 Examples:
   arview calibrate board -o board.pdf
@@ -100,8 +100,12 @@ Examples:
   arview calibrate photos/ --board charuco:11x8:21:16:DICT_5X5_100 -o camera.json
   arview calibrate clip.mp4 --board charuco:11x8:21:16:DICT_5X5_100 -o camera.json --plot camera.png
   arview calibrate *.heic --board charuco:11x8:21:16:DICT_5X5_100 --profile
-  arview calibrate photos/ --board charuco:9x6:25:18:DICT_4X4_50 -o camera.json -o ros:info.yaml
+  arview calibrate photos/ --board checkerboard:9x6:25 -o camera.json -o ros:info.yaml
   arview calibrate action/ --board charuco:11x8:21:16:DICT_5X5_100 --lens fisheye -o camera.json
+
+\b
+Boards without markers (checkerboard, circles, acircles: every second row shifted) count in pictures that
+show them whole. The pitch is from centre to centre, of acircles from row to row.
 
 \b
 -o may be given several times: .json is arview's own format (with uncertainties, covariance and verdict),
@@ -125,7 +129,8 @@ what took them. `arview calibrate profiles` lists them. An insufficient calibrat
     "board_spec",
     required=True,
     metavar="SPEC",
-    help="charuco:COLUMNSxROWS:SQUARE_MM:MARKER_MM:DICTIONARY, as printed on the board.",
+    help="charuco:COLUMNSxROWS:SQUARE_MM:MARKER_MM:DICTIONARY, checkerboard:COLUMNSxROWS:SQUARE_MM (inner corners),"
+    " circles:COLUMNSxROWS:PITCH_MM or acircles:COLUMNSxROWS:PITCH_MM.",
 )
 @click.option("-o", "--output", "outputs", multiple=True, metavar="[FORMAT:]CAMERA", help="Camera file to write.")
 @click.option("--profile", is_flag=False, flag_value="", metavar="[NAME]", help="Also store it as a profile.")
@@ -157,7 +162,7 @@ def lens(
     max_views: int,
     anyway: bool,
 ) -> None:
-    """Calibrate the camera that took PHOTOS (files, folders, globs), or VIDEO, of a ChArUco board."""
+    """Calibrate the camera that took PHOTOS (files, folders, globs), or VIDEO, of a board."""
     from arview.camera import format_and_path, holds_distortion, profile_name, profile_path, write_camera
     from arview.fiducials import parse_board
 

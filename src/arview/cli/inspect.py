@@ -44,7 +44,11 @@ Examples:
 @click.option("--station", metavar="NAME", help="Name of the measuring station; default: this machine.")
 @click.option("--camera", metavar="CAMERA", help="Calibrated camera file of the photos, or fov:DEG.")
 @click.option("--video-camera", metavar="CAMERA", help="The same for the video, if it was taken with another camera.")
-@click.option("--scale-file", metavar="FILE", help="TOML file of the boards, tags, scale bars and rig in view.")
+@click.option(
+    "--scale-file",
+    metavar="FILE",
+    help="TOML or JSON file of the boards, tags, tag layouts, scale bars and rig in view.",
+)
 @click.option(
     "--masks",
     metavar="FOLDER|auto",

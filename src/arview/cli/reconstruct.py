@@ -37,7 +37,9 @@ Examples:
 @click.option("--board", "boards", multiple=True, metavar="SPEC", help="Board of known size in view.")
 @click.option("--tag", "tags", multiple=True, metavar="SPEC", help="Tags of known size in view.")
 @click.option("--scale-bar", "bars", multiple=True, metavar="SPEC", help="Known distance of two tags.")
-@click.option("--scale-file", metavar="FILE", help="Boards, tags, scale bars and rig in one TOML file.")
+@click.option(
+    "--scale-file", metavar="FILE", help="Boards, tags, tag layouts, scale bars and rig in a TOML or JSON file."
+)
 @click.option("--rig", metavar="FILE", help="Known camera poses in mm.")
 @click.option(
     "--sparse",

@@ -1,16 +1,19 @@
-"""Boards and tags of coded markers: their description, the command-line form of it, and OpenCV's object for it."""
+"""Boards and tags: their description, the command-line form of it, and OpenCV's object for those of coded markers."""
 
 from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from typing import Any, NoReturn
+from typing import Any, Literal, NoReturn, cast
 
 from arview.errors import InputError
 
+BoardKind = Literal["charuco", "grid", "checkerboard", "circles", "acircles"]
+"""ChArUco board, grid of markers, checkerboard without markers, symmetric and asymmetric grid of circles."""
 BOARD_FORMS = (
-    "charuco:COLUMNSxROWS:SQUARE_MM:MARKER_MM:DICTIONARY or grid:COLUMNSxROWS:MARKER_MM:GAP_MM:DICTIONARY, "
-    "e.g. charuco:8x6:30:22:DICT_5X5_100"
+    "charuco:COLUMNSxROWS:SQUARE_MM:MARKER_MM:DICTIONARY, grid:COLUMNSxROWS:MARKER_MM:GAP_MM:DICTIONARY, "
+    "checkerboard:COLUMNSxROWS:SQUARE_MM (inner corners), circles:COLUMNSxROWS:PITCH_MM or "
+    "acircles:COLUMNSxROWS:PITCH_MM, e.g. charuco:8x6:30:22:DICT_5X5_100"
 )
 TAG_FORM = "DICTIONARY:SIDE_MM, e.g. apriltag36h11:20"
 DEFAULT_DICTIONARY = "DICT_APRILTAG_36h11"
@@ -20,26 +23,47 @@ MAX_CELLS = 2000
 
 @dataclass(frozen=True)
 class Board:
-    """A printed ChArUco or marker-grid board as OpenCV defines them.
+    """A printed board. ChArUco boards and grids of markers are as OpenCV defines them.
 
     Attributes:
-        is_charuco: chessboard with markers in its white squares; otherwise a grid of markers.
-        columns, rows: number of squares (ChArUco) or of markers (grid).
-        cell_mm: side of a square; in a grid, the pitch from marker to marker.
-        marker_mm: side of a marker.
-        dictionary: OpenCV's name of the marker dictionary.
+        kind: of board.
+        columns, rows: number of squares (ChArUco), of markers (grid), of inner corners (checkerboard: one fewer than
+            squares), or of circles; an asymmetric grid has ``columns`` circles in each of its ``rows``, of which every
+            second is shifted.
+        cell_mm: side of a square; in a grid, the pitch from marker to marker or from circle to circle; in an
+            asymmetric grid of circles, the distance of successive rows, half that of two circles of a row.
+        marker_mm: side of a marker; 0 without markers.
+        dictionary: OpenCV's name of the marker dictionary; empty without markers.
     """
 
-    is_charuco: bool
+    kind: BoardKind
     columns: int
     rows: int
     cell_mm: float
-    marker_mm: float
-    dictionary: str
+    marker_mm: float = 0.0
+    dictionary: str = ""
+
+    @property
+    def is_charuco(self) -> bool:
+        """Whether it is a chessboard with markers in its white squares."""
+        return self.kind == "charuco"
+
+    @property
+    def is_coded(self) -> bool:
+        """Whether markers tell its corners apart, so that it may be seen in part."""
+        return bool(self.dictionary)
 
     def __str__(self) -> str:
-        kind = "ChArUco board" if self.is_charuco else "marker board"
-        return f"{kind} {self.columns}×{self.rows}, {self.cell_mm:g} mm"
+        return f"{_TITLES[self.kind]} {self.columns}×{self.rows}, {self.cell_mm:g} mm"
+
+
+_TITLES: dict[BoardKind, str] = {
+    "charuco": "ChArUco board",
+    "grid": "marker board",
+    "checkerboard": "checkerboard",
+    "circles": "circle grid",
+    "acircles": "asymmetric circle grid",
+}
 
 
 @dataclass(frozen=True)
@@ -77,17 +101,19 @@ def dictionary_name(text: str) -> str:
 
 def parse_board(text: str) -> Board:
     """The board described on the command line, see BOARD_FORMS. Raises InputError."""
+    plain = re.fullmatch(r"(checkerboard|circles|acircles):(\d{1,9})x(\d{1,9}):([\d.]+)", text.strip(), re.IGNORECASE)
+    if plain:
+        kind, columns, rows, cell = plain.groups()
+        pitch_mm = parse_length_mm(text, cell)
+        return _checked_board(text, Board(cast(BoardKind, kind.lower()), int(columns), int(rows), pitch_mm))
     match = re.fullmatch(r"(charuco|grid):(\d{1,9})x(\d{1,9}):([\d.]+):([\d.]+):([\w-]+)", text.strip(), re.IGNORECASE)
     if not match:
         raise InputError(f"board {text!r}: expected {BOARD_FORMS}")
     kind, columns, rows, first, second, dictionary = match.groups()
-    is_charuco = kind.lower() == "charuco"
-    if is_charuco:
-        cell, marker = parse_length_mm(text, first), parse_length_mm(text, second)
-    else:
-        marker = parse_length_mm(text, first)
-        cell = marker + parse_length_mm(text, second)
-    return _checked_board(text, Board(is_charuco, int(columns), int(rows), cell, marker, dictionary))
+    kind = cast(BoardKind, kind.lower())
+    marker, cell_mm = parse_length_mm(text, first), parse_length_mm(text, second)
+    marker, cell_mm = (cell_mm, marker) if kind == "charuco" else (marker, marker + cell_mm)
+    return _checked_board(text, Board(kind, int(columns), int(rows), cell_mm, marker, dictionary_name(dictionary)))
 
 
 def parse_tags(text: str) -> Tags:
@@ -114,13 +140,17 @@ def parse_length_mm(where: str, value: object) -> float:
 
 
 def spec_of(board: Board) -> str:
-    """A ChArUco board in the form that the command line takes."""
-    sizes = f"{board.cell_mm:g}:{board.marker_mm:g}"
-    return f"charuco:{board.columns}x{board.rows}:{sizes}:{board.dictionary}"
+    """A board in the form that the command line takes."""
+    start = f"{board.kind}:{board.columns}x{board.rows}"
+    if not board.is_coded:
+        return f"{start}:{board.cell_mm:g}"
+    if board.is_charuco:
+        return f"{start}:{board.cell_mm:g}:{board.marker_mm:g}:{board.dictionary}"
+    return f"{start}:{board.marker_mm:g}:{board.cell_mm - board.marker_mm:g}:{board.dictionary}"
 
 
 def cv_board(board: Board) -> Any:
-    """OpenCV's ``CharucoBoard`` or ``GridBoard`` of the board, in mm."""
+    """OpenCV's ``CharucoBoard`` or ``GridBoard`` of a coded board, in mm."""
     import cv2
 
     size = (board.columns, board.rows)
@@ -138,13 +168,14 @@ def cv_dictionary(name: str) -> Any:
 
 
 def _checked_board(text: str, board: Board) -> Board:
-    """The board with OpenCV's name of its dictionary. Raises InputError when no such board can exist."""
-    columns, rows, minimum = board.columns, board.rows, 3 if board.is_charuco else 1
+    """The same board. Raises InputError when no such board can exist."""
+    columns, rows, minimum = board.columns, board.rows, 1 if board.kind == "grid" else 3
     if columns < minimum or rows < minimum or columns * rows > MAX_CELLS:
-        raise InputError(f"board {text!r}: {columns}×{rows} cells, expected at least {minimum}×{minimum}")
-    if board.marker_mm >= board.cell_mm:
+        raise InputError(
+            f"board {text!r}: {columns}×{rows} cells, expected at least {minimum}×{minimum}, {MAX_CELLS} in all at most"
+        )
+    if board.is_coded and board.marker_mm >= board.cell_mm:
         raise InputError(
             f"board {text!r}: markers of {board.marker_mm:g} mm do not fit in cells of {board.cell_mm:g} mm"
         )
-    name = dictionary_name(board.dictionary)
-    return Board(board.is_charuco, columns, rows, board.cell_mm, board.marker_mm, name)
+    return board

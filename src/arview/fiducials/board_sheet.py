@@ -95,7 +95,7 @@ def fit_board(
             f"{columns}×{rows} squares on {paper_mm[0]:g}×{paper_mm[1]:g} mm would be smaller than 3 mm; take fewer"
             " squares or a larger sheet"
         )
-    return Board(True, columns, rows, square, 0.5 * round(1.5 * square), dictionary)
+    return Board("charuco", columns, rows, square, 0.5 * round(1.5 * square), dictionary)
 
 
 def place_board(board: Board, paper_mm: tuple[float, float]) -> Sheet:
@@ -105,7 +105,9 @@ def place_board(board: Board, paper_mm: tuple[float, float]) -> Sheet:
         InputError: it is not a ChArUco board, does not fit, or its dictionary has too few markers.
     """
     if not board.is_charuco:
-        raise InputError(f"{board}: only ChArUco boards are printed; corners of single markers are less exact")
+        raise InputError(
+            f"{board}: only ChArUco boards are printed; their corners are exact, and they may be seen in part"
+        )
     needed, known = board.columns * board.rows // 2, _markers_in(board.dictionary)
     if needed > known:
         raise InputError(f"{board}: needs {needed} markers, {board.dictionary} has {known}; take a larger dictionary")

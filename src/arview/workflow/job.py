@@ -16,7 +16,7 @@ class InspectJob:
         serial: serial number of the part; None: that of the part file.
         camera: calibrated camera of the photos, or ``fov:DEG``; of the video when the photos are its frames.
         video_camera: camera of the video; None: that of the photos if the aspect ratio is the same, else a guess.
-        scale_file: TOML file with the boards, tags, scale bars and camera rig.
+        scale_file: TOML or JSON file with the boards, tags, tag layouts, scale bars and camera rig.
         unit: length unit of the CAD file if it does not specify one.
     """
 

@@ -102,6 +102,7 @@ SCALE = (
     '[[board]]\nspec = "charuco:8x6:30:22:DICT_5X5_100"\n[[tag]]\n'
     'dictionary = "DICT_4X4_50"\nside_mm = 20.0\nids = [1, 2]\n'
     '[[scale_bar]]\nids = [1, 2]\nlength_mm = 250.0\ndictionary = "DICT_4X4_50"\nstd_mm = 0.01\n'
+    "[[tag_layout]]\nstd_mm = 0.01\ncorners_mm = { 1 = [[0, 0, 0], [20, 0, 0], [20, 20, 0], [0, 20, 0]] }\n"
     "[rig]\ncentres_mm = { a = [0, 0, 0], b = [100, 0, 0] }\n"
 )
 RIG = json.dumps(

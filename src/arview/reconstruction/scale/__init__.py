@@ -1,4 +1,4 @@
-"""Scale and approximate CAD frame of a reconstruction, from boards, tags, scale bars, camera rigs and the CAD."""
+"""Scale and approximate CAD frame of a reconstruction, from boards, tags, layouts, bars, camera rigs and the CAD."""
 
 from arview.reconstruction.scale.cad import CadOptions
 from arview.reconstruction.scale.find import find_scale

@@ -6,6 +6,7 @@ import json
 import re
 import tomllib
 from dataclasses import dataclass, field
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,10 @@ from arview.fiducials import DEFAULT_DICTIONARY, Board, Tags, dictionary_name, p
 from arview.geometry import Array, check_rigid
 
 BAR_FORM = "ID1:ID2:LENGTH_MM or DICTIONARY:ID1:ID2:LENGTH_MM, e.g. 3:7:500.02"
+_KEYS = ("board", "tag", "tag_layout", "scale_bar", "rig")
+"""Tables of a scale file."""
+MAX_COORDINATE_MM = 1e6
+"""Corners farther from the origin are taken for a typing error."""
 MAX_TAG_ID = 999_999_999
 """No dictionary has a tag of a larger id."""
 
@@ -35,6 +40,21 @@ class ScaleBar:
     first: int
     second: int
     length_mm: float
+    std_mm: float = 0.02
+
+
+@dataclass(frozen=True)
+class TagLayout:
+    """Tags whose corners are known in one frame.
+
+    Attributes:
+        dictionary: OpenCV's name of the marker dictionary.
+        corners_mm: (4,3) corners of each tag, by its id; all tags list them in the same order around the tag.
+        std_mm: standard deviation of the distance of the corners farthest from each other.
+    """
+
+    dictionary: str
+    corners_mm: dict[int, Array]
     std_mm: float = 0.02
 
 
@@ -59,6 +79,15 @@ class ScaleSources:
     tags: tuple[Tags, ...] = ()
     bars: tuple[ScaleBar, ...] = ()
     rig: Rig | None = None
+    layouts: tuple[TagLayout, ...] = ()
+
+    def __post_init__(self) -> None:
+        for board in self.boards:
+            if not board.is_coded:
+                raise InputError(
+                    f"{board}: nothing tells its corners apart in several photos; for the scale give a ChArUco board, a"
+                    " grid of markers or tags"
+                )
 
 
 def parse_scale_bar(text: str, default_dictionary: str = DEFAULT_DICTIONARY) -> ScaleBar:
@@ -91,22 +120,28 @@ def load_rig(path: str | Path) -> Rig:
 
 
 def load_scale_file(path: str | Path) -> ScaleSources:
-    """Read scale sources from a TOML file with ``[[board]]``, ``[[tag]]``, ``[[scale_bar]]`` and ``[rig]``.
+    """Read scale sources from a file with ``[[board]]``, ``[[tag]]``, ``[[tag_layout]]``, ``[[scale_bar]]``, ``[rig]``.
 
-    A board has ``spec`` as on the command line; a tag ``dictionary``, ``side_mm`` and optionally ``ids``; a bar ``ids``
-    (two), ``length_mm`` and optionally ``dictionary`` and ``std_mm``; the rig what `load_rig` reads.
+    A board has ``spec`` as on the command line; a tag ``dictionary``, ``side_mm`` and optionally ``ids``; a layout
+    ``corners_mm`` (four corners x, y, z of each tag, by its id) and optionally ``dictionary`` and ``std_mm``; a bar
+    ``ids`` (two), ``length_mm`` and optionally ``dictionary`` and ``std_mm``; the rig what `load_rig` reads. The file
+    is TOML, or JSON of the same content if its name ends in .json.
 
     Raises:
-        InputError: the file cannot be read, is not TOML, or a key or value is invalid.
+        InputError: the file cannot be read, is not TOML or JSON, or a key or value is invalid.
     """
     path = Path(path)
+    kind = "JSON" if path.suffix.lower() == ".json" else "TOML"
     try:
-        content = tomllib.loads(path.read_bytes().decode("utf-8"))
+        text = path.read_bytes().decode("utf-8")
+        content = json.loads(text) if kind == "JSON" else tomllib.loads(text)
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror or error}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not valid TOML: {error}") from error
-    _only(content, ("board", "tag", "scale_bar", "rig"), f"{path}:")
+    except (ValueError, RecursionError) as error:  # of both formats, and of bytes that are no text
+        raise InputError(f"{path}: not valid {kind}: {error}") from error
+    if not isinstance(content, dict):
+        raise InputError(f"{path}: expected an object with {', '.join(_KEYS)}")
+    _only(content, _KEYS, f"{path}:")
     boards, tags, bars = [], [], []
     for entry in _entries(content, "board", ("spec",), (), path):
         boards.append(parse_board(str(entry["spec"])))
@@ -121,7 +156,33 @@ def load_scale_file(path: str | Path) -> ScaleSources:
         std_mm = parse_length_mm(f"{path}", entry.get("std_mm", ScaleBar.std_mm))
         bars.append(_bar(f"{path}", name, ids[0], ids[1], parse_length_mm(f"{path}", entry["length_mm"]), std_mm))
     rig = _rig(content["rig"], f"{path}: [rig]") if "rig" in content else None
-    return ScaleSources(tuple(boards), tuple(tags), tuple(bars), rig)
+    layouts = tuple(
+        _layout(entry, f"{path}: [[tag_layout]]")
+        for entry in _entries(content, "tag_layout", ("corners_mm",), ("dictionary", "std_mm"), path)
+    )
+    return ScaleSources(tuple(boards), tuple(tags), tuple(bars), rig, layouts)
+
+
+def _layout(entry: dict[str, Any], where: str) -> TagLayout:
+    """A layout from a table of a file. Raises InputError."""
+    listed = entry["corners_mm"]
+    if not isinstance(listed, dict) or not listed:
+        raise InputError(f"{where} corners_mm: expected four corners [x, y, z] for each id of a tag")
+    corners: dict[int, Array] = {}
+    for name, value in listed.items():
+        if not re.fullmatch(r"\d{1,9}", name):
+            raise InputError(f"{where} corners_mm: {name[:20]!r} is not the id of a tag")
+        try:
+            places = np.array(value, dtype=np.float64)
+        except (TypeError, ValueError, OverflowError):
+            places = np.zeros(0)
+        if places.shape != (4, 3) or not np.abs(places).max() < MAX_COORDINATE_MM:  # also false for NaN
+            raise InputError(f"{where} corners_mm: tag {name}: expected four corners [x, y, z] in mm")
+        if min(np.linalg.norm(places[a] - places[b]) for a, b in combinations(range(4), 2)) == 0.0:
+            raise InputError(f"{where} corners_mm: tag {name}: two of its corners are at the same place")
+        corners[int(name)] = places
+    std_mm = parse_length_mm(where, entry.get("std_mm", TagLayout.std_mm))
+    return TagLayout(dictionary_name(str(entry.get("dictionary", DEFAULT_DICTIONARY))), corners, std_mm)
 
 
 def _tag_ids(where: str, value: Any) -> tuple[int, ...]:

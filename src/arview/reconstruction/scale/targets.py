@@ -1,7 +1,7 @@
 """Scale from coded targets of known size, and from known positions of, or distances between, the cameras.
 
-Corners of boards and tags are found in every photo (`fiducials.targets`) and triangulated with the poses of the
-reconstruction; their known distances then give millimetres per unit.
+Corners of boards and tags, also of layouts (`scale.layout`), are found in every photo (`fiducials.targets`) and
+triangulated with the poses of the reconstruction; their known distances then give millimetres per unit.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from arview.core.fits import robust_sigma
 from arview.core.parallel import pool
 from arview.fiducials import Board, CornerKey, Tags, cv_board, find_corners
 from arview.geometry import Array
+from arview.reconstruction.scale.layout import scale_from_layout
 from arview.reconstruction.scale.similarity import fit_points
 from arview.reconstruction.scale.specs import Rig, ScaleBar, ScaleSources
 from arview.reconstruction.scale.triangulation import TriangulatedCorners, triangulate_corners
@@ -40,16 +41,17 @@ def scale_from_targets(
     read_gray: Callable[[PosedPhoto], NDArray[np.uint8]],
     sources: ScaleSources,
 ) -> tuple[list[ScaleEvidence], list[str]]:
-    """Scale evidence of the boards, tags and scale bars in view, and messages about those not found.
+    """Scale evidence of the boards, tags, layouts and scale bars in view, and messages about those not found.
 
     Args:
         photos: placed photos.
         read_gray: returns the upright (H,W) uint8 picture of a photo, of the size of its camera.
         sources: the targets that may be in view.
     """
-    if not (sources.boards or sources.tags or sources.bars):
+    if not (sources.boards or sources.tags or sources.bars or sources.layouts):
         return [], []
     dictionaries = {tags.dictionary for tags in sources.tags} | {bar.dictionary for bar in sources.bars}
+    dictionaries |= {layout.dictionary for layout in sources.layouts}
 
     def find(photo: PosedPhoto) -> dict[CornerKey, Array]:
         return find_corners(read_gray(photo), photo.camera, sources.boards, dictionaries)
@@ -58,6 +60,11 @@ def scale_from_targets(
     corners = triangulate_corners([p.camera for p in photos], [p.cam_from_scan for p in photos], found)
     evidence: list[ScaleEvidence] = []
     missing: list[str] = []
+    for layout in sources.layouts:
+        side_px = _side_px(found, layout.dictionary)
+        known, why = scale_from_layout(layout, corners, TAG_EDGE_STD_PX / side_px)
+        evidence += [known] if known else []
+        missing += [why] if why else []
     for number, board in enumerate(sources.boards):
         _add(evidence, missing, _board_evidence(board, number, corners), str(board))
     for tags in sources.tags:
@@ -65,7 +72,7 @@ def scale_from_targets(
             int(i) for b in sources.boards if b.dictionary == tags.dictionary for i in cv_board(b).getIds().ravel()
         }
         what = f"tags {tags.dictionary.removeprefix('DICT_')} of {tags.side_mm:g} mm"
-        _add(evidence, missing, _tag_evidence(tags, in_boards, corners, _side_px(found, tags), what), what)
+        _add(evidence, missing, _tag_evidence(tags, in_boards, corners, _side_px(found, tags.dictionary), what), what)
     for bar in sources.bars:
         what = f"scale bar from tag {bar.first} to tag {bar.second}, {bar.length_mm:g} mm"
         _add(evidence, missing, _bar_evidence(bar, corners, what), what)
@@ -123,13 +130,13 @@ def _board_evidence(board: Board, number: int, corners: TriangulatedCorners) -> 
     return ScaleEvidence("board", fit.similarity.scale, float(np.hypot(fit.scale_std, PRINT_STD)), detail)
 
 
-def _side_px(corners_by_photo: Sequence[dict[CornerKey, Array]], tags: Tags) -> float:
+def _side_px(corners_by_photo: Sequence[dict[CornerKey, Array]], dictionary: str) -> float:
     """Median side length, in the photos, of the tags of a dictionary."""
     sides = [
         float(np.linalg.norm(corners[key] - corners[(*key[:2], 1)]))
         for corners in corners_by_photo
         for key in corners
-        if key[0] == tags.dictionary and key[2] == 0
+        if key[0] == dictionary and key[2] == 0
     ]
     return float(np.median(sides)) if sides else 1.0
 

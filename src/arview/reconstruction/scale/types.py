@@ -10,9 +10,9 @@ import numpy as np
 from arview.geometry import Array
 from arview.reconstruction.scale.similarity import Similarity
 
-Kind = Literal["board", "tag", "scale_bar", "rig", "cad"]
+Kind = Literal["tag_layout", "board", "tag", "scale_bar", "rig", "cad"]
 """Kinds of evidence."""
-TRUST: tuple[Kind, ...] = ("board", "tag", "scale_bar", "rig", "cad")
+TRUST: tuple[Kind, ...] = ("tag_layout", "board", "tag", "scale_bar", "rig", "cad")
 """Kinds of evidence, the most trusted first."""
 
 
