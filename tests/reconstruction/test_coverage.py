@@ -82,6 +82,25 @@ def test_one_side_and_gap() -> None:
     assert any("240° around the side −x of the model" in line for line in advice)
 
 
+@pytest.mark.parametrize("middle_deg", [0.0, 90.0, 200.0])
+def test_photos_from_one_side_are_told_to_go_to_the_other(middle_deg: float) -> None:
+    """Photos at three heights within 110° of azimuth: what lacks is the other side at their height, not from below."""
+    shots = [
+        shot
+        for k, elevation in enumerate((30.0, 45.0, 62.0))
+        for shot in views([middle_deg - 50.0 + 5.0 * k + 20.0 * j for j in range(6)], elevation)
+    ]
+    (line,) = [line for line in coverage(part(), shots).advice if line.startswith("no photo within")]
+    gap_deg, side = float(line.split("within ")[1].split("°")[0]), line.split("side ")[1].split(" of")[0]
+    assert 235.0 <= gap_deg <= 260.0
+    other = np.deg2rad(middle_deg + 5.0 + 180.0)  # their middle is 5° farther
+    assert side == " ".join(
+        f"{'+' if value > 0 else '−'}{name}"
+        for name, value in zip("xy", (np.cos(other), np.sin(other)), strict=True)
+        if abs(value) > 0.38
+    )
+
+
 def test_small_in_the_picture_or_outside_is_not_seen() -> None:
     away = look_at((0, -500, 300), (0, -2000, 300), (0, 0, 1))
     names = [component.name for component in part().components]

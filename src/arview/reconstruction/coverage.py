@@ -32,6 +32,9 @@ ALONE_DEG = 35.0
 """A photo farther than this from its nearest neighbour cannot be matched well."""
 GAP_DEG = 150.0
 """Azimuth range without photos that is reported."""
+UPRIGHT_SPREAD, UPRIGHT_SHARE = 0.2, 0.5
+"""Mean size of the second direction of the cameras' rights from which they have an axis, and largest share of the third
+in it for cameras that are held upright."""
 TRIED_DIRECTIONS = 80
 """Directions, about 22° apart, from which a poorly seen component is searched for in the CAD."""
 
@@ -85,7 +88,7 @@ def coverage(
     if len(names) != len(views):
         raise InputError(f"coverage: {len(names)} names for {len(views)} camera poses")
     centres = np.array([-pose[:3, :3].T @ pose[:3, 3] for _, pose in views])
-    axis = _orbit_axis(unit(centres - model.center_in_model))
+    axis = _orbit_axis(unit(centres - model.center_in_model), np.array([pose[0, :3] for _, pose in views]))
     seen = np.array([components_seen(model, camera, pose) for camera, pose in views])
     components = []
     for index, component in enumerate(model.components):
@@ -207,12 +210,21 @@ def _sphere(count: int) -> Array:
     return np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), z], axis=1)
 
 
-def _orbit_axis(directions: Array) -> Array:
-    """The axis about which the photos were taken: normal of their best plane, on their side of the part."""
+def _orbit_axis(directions: Array, rights: Array) -> Array:
+    """The axis about which the photos were taken, on their side of the part.
+
+    It is upright in all pictures: across the right of each camera (N,3), in the model frame. Where these hardly differ,
+    or the cameras were turned, it is the normal of the best plane through the directions (N,3) of the photos; those of
+    photos from one side lie in a plane across the line of sight, which is no orbit.
+    """
     mean = directions.mean(axis=0)
-    if len(directions) < 3:
+    _, sizes, ways = np.linalg.svd(rights, full_matrices=True)
+    if len(sizes) == 3 and sizes[1] > UPRIGHT_SPREAD * np.sqrt(len(rights)) and sizes[2] < UPRIGHT_SHARE * sizes[1]:
+        axis = ways[2]
+    elif len(directions) < 3:
         return unit(mean)
-    axis = np.linalg.svd(directions - mean)[2][2]
+    else:
+        axis = np.linalg.svd(directions - mean)[2][2]
     return np.asarray(axis if axis @ mean >= 0 else -axis)
 
 
