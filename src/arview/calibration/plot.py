@@ -62,7 +62,7 @@ def draw(calibration: Calibration, kind: str = "png") -> bytes:
             axes.set_aspect("equal")
             axes.set_xlabel("u, px")
         left.set_ylabel("v, px")
-        focal = f"focal length {camera.fx:.1f} px ± {100 * verdict.focal_u:.2f} %"
+        focal = f"focal length {camera.fx:.1f} px ± {100 * verdict.focal_u:.2f} % (k = 2)"
         made.suptitle(f"{calibration.sightings.label}: {verdict.grade.value}, {focal}", x=0.01, ha="left", fontsize=11)
         out = io.BytesIO()
         metadata = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}.get(kind)

@@ -284,7 +284,7 @@ def _camera_lines(result: calibration.Calibration) -> list[str]:
     ]
     worst = f"{verdict.pixel_u_px[0]:.2f} px in the median, {verdict.pixel_u_px[1]:.2f} px at worst"
     return [
-        f"camera: {', '.join(cells[:4])} px",
-        f"lens ({calibration.lens_of(result.camera)}): {', '.join(cells[4:])}",
+        f"camera: {', '.join(cells[:4])} px (k = 2)",
+        f"lens ({calibration.lens_of(result.camera)}): {', '.join(cells[4:])} (k = 2)",
         f"uncertainty (k = 2): focal length {100 * verdict.focal_u:.2f} %, image position of a ray {worst}",
     ]

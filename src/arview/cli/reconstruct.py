@@ -173,7 +173,7 @@ def _print(result: reconstruction.Reconstruction, has_part: bool) -> None:
             say(f"warning: {warning}")
         for evidence in scale.evidence:
             used = "" if evidence.is_used else " (not used)"
-            click.echo(f"scale from {evidence.detail}: ±{100 * evidence.std:.3f} %{used}")
+            click.echo(f"scale from {evidence.detail}: ± {200 * evidence.std:.3f} % (k = 2){used}")
         if scale.scale is None:
             say("warning: NO SCALE: lengths are in an arbitrary unit; give --part, --board, --tag or --scale-bar")
         elif scale.model_from_scan is None and has_part:

@@ -349,7 +349,7 @@ def _about(found: reconstruction.Reconstruction, stage: str) -> str:
         return f"{len(sparse.photos)} of {total} photos placed, {quality.reprojection_rms_px:.2f} px rms"
     if stage == "scale" and scale is not None and scale.scale_std is not None:
         kinds = ", ".join(dict.fromkeys(one.kind for one in scale.evidence if one.is_used))
-        return f"scale from {kinds}, ±{100 * scale.scale_std:.3f} %"
+        return f"scale from {kinds}, ± {200 * scale.scale_std:.3f} % (k = 2)"
     if stage == "dense" and found.cloud is not None:
         return f"{len(found.cloud.points)} points"
     return ""
