@@ -10,6 +10,7 @@ import click
 from arview import reconstruction, workflow
 from arview.cli.common import UNIT, main, say, stage_bar
 from arview.cli.exit_codes import ExitCode
+from arview.core.atomic import write_file
 from arview.errors import InputError
 
 if TYPE_CHECKING:
@@ -52,6 +53,7 @@ Examples:
     metavar="FOLDER|auto",
     help="Masks IMAGE.png, black: not used; auto: from the CAD.",
 )
+@click.option("--points", metavar="FILE.csv", help="Also write the points with their standard uncertainty.")
 @click.option("--until", type=click.Choice(STAGES), default="dense", show_default=True, help="Last stage to do.")
 @click.option(
     "--band",
@@ -92,6 +94,7 @@ def reconstruct(
     rig: str | None,
     poses: str | None,
     masks: str | None,
+    points: str | None,
     until: str,
     band: float,
     max_frames: int,
@@ -109,6 +112,8 @@ def reconstruct(
     from arview.reconstruction import run
 
     folder = Path(output)
+    if points is not None and until == "photos":
+        raise InputError("--points needs camera poses; give --until sparse or later")
     if folder.exists() and not folder.is_dir():
         raise InputError(f"{output}: is a file; give a folder for the results")
     if Path(source).is_dir() and folder.resolve() == Path(source).resolve():
@@ -130,6 +135,10 @@ def reconstruct(
     with stage_bar() as progress:
         result = run.reconstruct(source, folder, part, camera, options, progress=progress)
     _print(result, part is not None)
+    if points is not None and result.sparse is not None:
+        table = reconstruction.points_table(result.sparse, "mm" if result.is_metric else "unit")
+        write_file(Path(points), table.encode())
+        click.echo(f"wrote {points}: {len(result.sparse.points_in_scan)} points, standard uncertainty (k = 1)")
 
 
 def _sources(

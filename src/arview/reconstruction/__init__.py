@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from arview.reconstruction.colmap import import_pycolmap as import_pycolmap
     from arview.reconstruction.colmap import read_reconstruction as read_reconstruction
     from arview.reconstruction.colmap import sparse_model_of as sparse_model_of
+    from arview.reconstruction.covariance import points_table as points_table
     from arview.reconstruction.covariance import reprojection_residuals as reprojection_residuals
     from arview.reconstruction.coverage import DIRECTION_DEG as DIRECTION_DEG
     from arview.reconstruction.coverage import DIRECTIONS_WANTED as DIRECTIONS_WANTED
@@ -81,7 +82,7 @@ __getattr__, __dir__, __all__ = lazy_door(
             "read_reconstruction",
             "sparse_model_of",
         ),
-        "covariance": ("reprojection_residuals",),
+        "covariance": ("points_table", "reprojection_residuals"),
         "coverage": (
             "ComponentCoverage",
             "DIRECTIONS_WANTED",

@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from arview.geometry import Array, skew
+from arview.errors import CannotMeasureError
+from arview.geometry import Array, apply, skew
 from arview.reconstruction.colmap import import_pycolmap
 from arview.reconstruction.types import SparseModel
 
@@ -71,6 +72,72 @@ def noise_variance(residuals: Array) -> float:
     weights = 1.0 / (1.0 + squares)
     slope = float(np.mean(weights - squares * weights**2))
     return float(np.mean(weights) * np.mean(weights**2 * squares) * LOSS_PX**2 / (2.0 * slope**2))
+
+
+def point_covariances(sparse: SparseModel) -> Array:
+    """(N,3,3) covariances of the points, in the frame in which the cameras together vary least.
+
+    By the Schur complement of the adjustment (Triggs et al., "Bundle adjustment — a modern synthesis", 2000, section 6)
+    that of a point is what its own observations leave open with known poses, and the poses' covariance carried to it.
+    What scale and intrinsics add is not in it.
+
+    Raises:
+        CannotMeasureError: the covariance of the poses is not known.
+    """
+    if sparse.pose_covariance is None:
+        raise CannotMeasureError("points: the covariance of the camera poses is not known, so their U is not either")
+    count, noise = len(sparse.points_in_scan), _noise_variance(sparse)
+    squares = np.sum(reprojection_residuals(sparse) ** 2, axis=1) / LOSS_PX**2
+    by_point = np.empty((len(squares), 2, 3))
+    by_pose = np.empty((len(squares), 2, 6))
+    for index, photo in enumerate(sparse.photos):
+        of = np.flatnonzero(sparse.observed_photo == index)
+        rotation = photo.cam_from_scan[:3, :3]
+        in_cam = apply(photo.cam_from_scan, sparse.points_in_scan[sparse.observed_point[of]])
+        delta = 1e-6 * in_cam[:, 2:]
+        pixels = photo.camera.project(in_cam)
+        by_cam = np.stack(
+            [(photo.camera.project(in_cam + delta * axis) - pixels) / delta for axis in np.eye(3)], axis=2
+        )
+        by_point[of] = by_cam @ rotation
+        by_pose[of] = np.concatenate([-by_cam @ _skews(in_cam), by_cam], axis=2)
+    weighed = by_point / (1.0 + squares)[:, None, None]
+    information = np.zeros((count, 3, 3))
+    np.add.at(information, sparse.observed_point, np.einsum("kpi,kpj->kij", weighed, by_point))
+    inverse = np.linalg.pinv(information, hermitian=True)
+    carried = -inverse[sparse.observed_point] @ np.einsum("kpi,kpj->kij", weighed, by_pose)
+    result = noise * inverse
+    order = np.argsort(sparse.observed_point, kind="stable")
+    starts = np.searchsorted(sparse.observed_point[order], np.arange(count + 1))
+    for point in range(count):
+        of = order[starts[point] : starts[point + 1]]
+        columns = (6 * sparse.observed_photo[of][:, None] + np.arange(6)).ravel()
+        along = np.concatenate(list(carried[of]), axis=1) if len(of) else np.zeros((3, 0))
+        result[point] += along @ sparse.pose_covariance[np.ix_(columns, columns)] @ along.T
+    return result
+
+
+def points_table(sparse: SparseModel, unit: str) -> str:
+    """The points as CSV: place and standard uncertainty (k = 1) along the axes, photos and rms residual of each."""
+    std = np.sqrt(np.einsum("nii->ni", point_covariances(sparse)))
+    photos = np.bincount(sparse.observed_point, minlength=len(std))
+    squares = np.sum(reprojection_residuals(sparse) ** 2, axis=1)
+    rms = np.sqrt(np.bincount(sparse.observed_point, squares, len(std)) / np.maximum(2 * photos, 1))
+    names = [f"{name}_{unit}" for name in ("x", "y", "z", "ux", "uy", "uz")]
+    rows = [
+        ",".join([*(f"{value:.6g}" for value in (*place, *sigma)), str(number), f"{residual:.3f}"])
+        for place, sigma, number, residual in zip(sparse.points_in_scan, std, photos, rms, strict=True)
+    ]
+    return "\n".join([",".join([*names, "photos", "rms_px"]), *rows]) + "\n"
+
+
+def _skews(vectors: Array) -> Array:
+    """(N,3,3) cross-product matrices of vectors (N,3)."""
+    return (
+        np.cross(np.eye(3)[None], vectors[:, None, :]).transpose(0, 2, 1) * -1.0
+        if len(vectors)
+        else np.zeros((0, 3, 3))
+    )
 
 
 def reprojection_residuals(sparse: SparseModel) -> Array:
