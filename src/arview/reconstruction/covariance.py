@@ -13,6 +13,8 @@ from arview.reconstruction.types import SparseModel
 
 LOSS_PX = 0.5
 """Residual at which Cauchy's loss of the adjustment halves the weight of an observation."""
+MAX_ABSORBED = 0.9
+"""Largest share of the noise that the unknowns are taken to absorb; with more, nothing is known of it."""
 _RAD_PER_TANGENT = 2.0
 """Rotation vector per tangent vector of Ceres, which changes a unit quaternion by half the rotation vector."""
 
@@ -56,22 +58,27 @@ def _noise_variance(sparse: SparseModel) -> float:
     """Variance in px² by which the inverse of the adjustment's information is multiplied."""
     residuals = reprojection_residuals(sparse)
     unknowns = 3 * len(sparse.points_in_scan) + 6 * len(sparse.photos)
-    fit = residuals.size / max(1, residuals.size - unknowns)  # the fitted unknowns absorb a share of the noise
-    return noise_variance(residuals) * fit
+    return noise_variance(residuals, min(unknowns / max(1, residuals.size), MAX_ABSORBED))
 
 
-def noise_variance(residuals: Array) -> float:
+def noise_variance(residuals: Array, absorbed: float = 0.0) -> float:
     """Variance in px² of one coordinate of observations with residuals (K,2), as their robust adjustment has it.
 
-    An M-estimate has the covariance of least squares times ``E[ψ²] / E[ψ']²`` (Huber, "Robust Statistics", 1981,
-    section 7.6). The adjuster's information weighs each observation by the derivative of its loss, Cauchy's, whose mean
-    is the third factor. So tails count by what they do to the result: neither fully, as in the standard deviation of
-    the residuals, nor not at all, as in their median.
+    An M-estimate has the covariance of least squares times ``E[ψ²] / E[ψ']²``, corrected for few observations (Huber,
+    "Robust Statistics", 1981, sections 7.6 and 7.10). The adjuster's information weighs each observation by the
+    derivative of its loss, Cauchy's, whose mean is the third factor. So tails count by what they do to the result:
+    neither fully, as in the standard deviation of the residuals, nor not at all, as in their median.
+
+    Args:
+        residuals: observed minus projected.
+        absorbed: number of fitted unknowns by that of coordinates: the share of the noise that they absorb.
     """
     squares = np.sum(residuals**2, axis=1) / LOSS_PX**2
     weights = 1.0 / (1.0 + squares)
-    slope = float(np.mean(weights - squares * weights**2))
-    return float(np.mean(weights) * np.mean(weights**2 * squares) * LOSS_PX**2 / (2.0 * slope**2))
+    slopes = np.concatenate([weights, weights - 2.0 * squares * weights**2])  # along the residual and across it
+    few = 1.0 + absorbed * float(np.var(slopes) / np.mean(slopes) ** 2)
+    spread = float(np.mean(weights**2 * squares)) * LOSS_PX**2 / (2.0 * (1.0 - absorbed))
+    return float(few**2 * np.mean(weights) * spread / np.mean(slopes) ** 2)
 
 
 def point_covariances(sparse: SparseModel) -> Array:
