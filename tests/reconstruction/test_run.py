@@ -16,6 +16,7 @@ import arview.reconstruction.run as run
 from arview.cad import Model, Part, load_part
 from arview.cad.model import make_model
 from arview.cli import main
+from arview.errors import CannotMeasureError
 from arview.geometry import Array, apply, invert, rotation_angle_rad
 from arview.reconstruction.dense import DenseOptions
 from arview.reconstruction.features import FeatureOptions
@@ -241,3 +242,6 @@ def test_photos_of_another_part_give_no_frame(
     assert result.scale is not None and result.scale.model_from_scan is None
     assert result.scale.scale is None and result.scale.why_no_frame
     assert not result.is_metric
+    with pytest.raises(CannotMeasureError, match=r"was not found in the photos: .* Is it this part"):
+        reconstruct(folder / "photos", tmp_path / "out", other, options=replace(OPTIONS, needs_scale=True))
+    assert not (tmp_path / "out" / "cloud.ply").exists()

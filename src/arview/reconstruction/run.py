@@ -32,7 +32,7 @@ from arview.core.checks import PATH, check_type
 from arview.core.extras import require
 from arview.core.progress import Progress
 from arview.core.stage_cache import Stages, content_key, key_of, write_json
-from arview.errors import InputError, OutputError
+from arview.errors import CannotMeasureError, InputError, OutputError
 from arview.geometry import Array
 from arview.reconstruction.colmap import read_reconstruction, sparse_model_of, write_model
 from arview.reconstruction.coverage import Coverage, coverage
@@ -90,6 +90,7 @@ class ReconstructOptions:
     known: KnownPairs = field(
         default_factory=KnownPairs
     )  # pairs of photos to be matched, or rough poses to choose them
+    needs_scale: bool = False  # end before the cloud where nothing gives the scale, because the cloud cannot either
     last_stage: StageName = "dense"
     starts_over: bool = False  # discard what an earlier run left in the folder
 
@@ -200,6 +201,11 @@ class _ReconstructionRun:
             part_key = None if self.part is None else (self.part.model.source_hash, self.part.effective_view_range)
             key = key_of(key, part_key, self.options.sources, SCALE)
             scale = self._scale(intake.photos, sparse, key)
+            if self.options.needs_scale and scale.scale is None:
+                raise CannotMeasureError(
+                    f"the part was not found in the photos: {scale.why_no_frame}. Is it this part? If it is, put a "
+                    "board or tag beside it and name it in a scale file"
+                )
             sparse, cad = self._metric(sparse, scale)
             cover = self._coverage(sparse, cad)
         if last >= 3 and sparse is not None:
