@@ -113,7 +113,7 @@ def point_covariances(sparse: SparseModel) -> Array:
     np.add.at(information, sparse.observed_point, np.einsum("kpi,kpj->kij", weighed, by_point))
     inverse = np.linalg.pinv(information, hermitian=True)
     carried = -inverse[sparse.observed_point] @ np.einsum("kpi,kpj->kij", weighed, by_pose)
-    result = noise * inverse
+    result: Array = np.asarray(noise * inverse, dtype=np.float64)
     order = np.argsort(sparse.observed_point, kind="stable")
     starts = np.searchsorted(sparse.observed_point[order], np.arange(count + 1))
     for point in range(count):
@@ -140,11 +140,7 @@ def points_table(sparse: SparseModel, unit: str) -> str:
 
 def _skews(vectors: Array) -> Array:
     """(N,3,3) cross-product matrices of vectors (N,3)."""
-    return (
-        np.cross(np.eye(3)[None], vectors[:, None, :]).transpose(0, 2, 1) * -1.0
-        if len(vectors)
-        else np.zeros((0, 3, 3))
-    )
+    return np.asarray(np.cross(vectors[:, None, :], np.eye(3)[None]).transpose(0, 2, 1))
 
 
 def reprojection_residuals(sparse: SparseModel) -> Array:
