@@ -107,7 +107,7 @@ def point_covariances(sparse: SparseModel) -> Array:
             [(photo.camera.project(in_cam + delta * axis) - pixels) / delta for axis in np.eye(3)], axis=2
         )
         by_point[of] = by_cam @ rotation
-        by_pose[of] = np.concatenate([-by_cam @ _skews(in_cam), by_cam], axis=2)
+        by_pose[of] = np.concatenate([np.cross(in_cam[:, None], by_cam), by_cam], axis=2)
     weighed = by_point / (1.0 + squares)[:, None, None]
     information = np.zeros((count, 3, 3))
     np.add.at(information, sparse.observed_point, np.einsum("kpi,kpj->kij", weighed, by_point))
@@ -136,11 +136,6 @@ def points_table(sparse: SparseModel, unit: str) -> str:
         for place, sigma, number, residual in zip(sparse.points_in_scan, std, photos, rms, strict=True)
     ]
     return "\n".join([",".join([*names, "photos", "rms_px"]), *rows]) + "\n"
-
-
-def _skews(vectors: Array) -> Array:
-    """(N,3,3) cross-product matrices of vectors (N,3)."""
-    return np.asarray(np.cross(vectors[:, None, :], np.eye(3)[None]).transpose(0, 2, 1))
 
 
 def reprojection_residuals(sparse: SparseModel) -> Array:

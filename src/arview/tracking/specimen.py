@@ -380,7 +380,10 @@ class SpecimenTracking:
             s.apply(Event.CONTRADICTED)
             return estimate, "ambiguous: it looks the same when it is turned; show another side"
         if not s.hypotheses:
-            return estimate, reason if reason or not self._is_plain(estimate) else PLAIN_FACE
+            if reason or not self._is_plain(estimate):
+                return estimate, reason
+            s.apply(Event.CONTRADICTED)
+            return estimate, PLAIN_FACE
         others = s.hypotheses.poses(pose)
         score, *other_scores = [score for _, score in self.tracker.refined_near(image, [pose, *others])]
         if (better := s.hypotheses.update(score, other_scores)) is not None:
@@ -395,13 +398,12 @@ class SpecimenTracking:
     def _is_plain(self, estimate: Estimate) -> bool:
         """Whether the part, found by a search, has shown no more than one plain face; it is in doubt then."""
         s = self._state
+        if s.is_given:
+            return False
         if s.lines_shown < FACE_LINES:
             lines = self.search.local.view_lines(estimate.cam_from_model @ self._part.model_from_body)
             s.lines_shown = max(s.lines_shown, lines)
-        is_plain = s.lines_shown < FACE_LINES and not s.is_given
-        if is_plain:
-            s.apply(Event.CONTRADICTED)
-        return is_plain
+        return s.lines_shown < FACE_LINES
 
     def _recheck_base(self, image: NDArray[np.uint8], estimate: Estimate) -> Estimate:
         """Search again for a part of which little is seen, and go on where it is if that is elsewhere."""

@@ -17,8 +17,8 @@ from arview.measurement.types import Method, Move
 HEIGHTS_MM, HEIGHT_SHARE = (8.0, 5.6, 4.0, 2.8, 2.0, 1.4, 1.0, 0.7, 0.5), 0.1
 """Heights above other components that are tried, and share of the surface that must be higher."""
 NEAR_JOINT_MM = 1.0
-"""The same where other edges do not determine all directions: many joints are bolted, clipped or riveted, not welded.
-"""
+"""As `JOINT_MM`, where the edges farther away do not determine all directions: many joints are bolted, clipped or
+riveted, not welded."""
 HEIGHT_SAMPLES = 600
 """Samples of a component by which its height is found."""
 

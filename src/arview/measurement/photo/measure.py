@@ -29,11 +29,11 @@ MIN_CLEAR = 3
 """Components whose edges are found so well that one without any edges is missing."""
 GONE_SHARE = 0.6
 """A component is missing when more than this share of what it would hide is visible."""
-
 TRUSTED_SUPPORT = 0.6
 """Share of a component's edges found from which a sweep that contradicts them is not used."""
-TURNED_SUPPORT = 0.5
-"""Share of its edges that must be found where a component is turned: the best of several places fits by chance more."""
+RETRIED_SUPPORT = 0.5
+"""Share of its edges that must be found at a second try, turned or by the joints too: the best of several fits by
+chance more often."""
 TURNS_DEG = (-2.5, 2.5, -5.0, 5.0, -8.0, 8.0)
 """Turns on its seat from which a component is sought that neither method finds near its place."""
 
@@ -142,9 +142,8 @@ def _by_edges(body: MeasuredComponent) -> Move | NotMeasured:
         return edges
     start = edges.measured_from_nominal if isinstance(edges, Move) else None
     more = ComponentEdges(body.with_joints()).measure(start)
-    return (
-        more if isinstance(more, Move) and more.support >= TURNED_SUPPORT and len(more.undetermined) < count else edges
-    )
+    is_better = isinstance(more, Move) and more.support >= RETRIED_SUPPORT and len(more.undetermined) < count
+    return more if is_better else edges
 
 
 def _turned(body: MeasuredComponent, failed: NotMeasured) -> Move | NotMeasured:
@@ -155,7 +154,7 @@ def _turned(body: MeasuredComponent, failed: NotMeasured) -> Move | NotMeasured:
     axis = normals.mean(axis=0) / max(float(np.linalg.norm(normals.mean(axis=0))), 1e-9)
     starts = (body.moved(np.eye(4), np.concatenate([np.deg2rad(angle) * axis, np.zeros(3)])) for angle in TURNS_DEG)
     measured = [ComponentEdges(body).measure(start) for start in starts]
-    found = [one for one in measured if isinstance(one, Move) and one.support >= TURNED_SUPPORT]
+    found = [one for one in measured if isinstance(one, Move) and one.support >= RETRIED_SUPPORT]
     return max(found, key=lambda one: one.support, default=failed)
 
 
