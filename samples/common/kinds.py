@@ -24,6 +24,7 @@ class SetOptions:
         finish: surface of the components, and of the base but for chrome.
         focal_px: focal length at a picture width of 1600 px; None lets the seed choose.
         distortion: radial distortion k1, k2; None lets the seed choose.
+        lens_changes: autofocus and stabiliser change the lens in every photo, as a phone's do.
         width: picture width in px; pictures are 4:3.
         passes: passes of rendering, which keep memory low.
         samples: path samples per pixel and pass.
@@ -37,6 +38,7 @@ class SetOptions:
     finish: str = "steel"
     focal_px: float | None = None
     distortion: tuple[float, float] | None = None
+    lens_changes: bool = False
     width: int = 1600
     passes: int = 2
     samples: int = 4
@@ -61,6 +63,7 @@ class Kind:
         missing: number of components that are absent; the first has fallen and lies on the part.
         spots: places (3,) on the base's surface where fallen and foreign objects may lie.
         foreign: number of foreign objects on the part.
+        litter: whether washers, keys and chips, which are flat and small, are among the foreign objects.
         rings: elevation (deg) and distance (mm) of the rings of photos.
         aim: point that the photos look at.
         aim_spread: 1 sigma of the hand-held aim.
@@ -89,6 +92,7 @@ class Kind:
     missing: int = 0
     spots: tuple[tuple[float, float, float], ...] = ()
     foreign: int = 0
+    litter: bool = False
     finish: str = "steel"
     tint: tuple[float, float, float] = (0.3, 0.34, 0.36)
     metals: dict[str, str] = field(default_factory=dict)

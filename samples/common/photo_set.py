@@ -47,10 +47,14 @@ def make_truth(kind: Kind, out: Path, options: SetOptions) -> None:
         "dist_k1_k2": camera["dist"][:2],
         "made": {name: getattr(options, name) for name in ("photos", "layout", "light", "finish")},
     }
+    if options.lens_changes:
+        head["made"]["lens_changes"] = True
     tables = {
         "cam_from_model_mm": {photo_name(i): p.tolist() for i, p in enumerate(shots.places(kind, options))},
         "truth": truth,
     }
+    if options.lens_changes:
+        tables["lenses"] = {photo_name(i): shots.camera_of_photo(options, i) for i in range(options.photos)}
     if kind.missing or kind.foreign:
         tables["foreign"] = {
             name: {"low_mm": vertices.min(axis=0).round(3).tolist(), "high_mm": vertices.max(axis=0).round(3).tolist()}
@@ -133,6 +137,7 @@ def _parser(kind: Kind, text: str, commands: tuple[str, ...]) -> argparse.Argume
     parser.add_argument("--finish", choices=FINISHES, default=kind.finish, help="default: %(default)s")
     parser.add_argument("--focal", type=float, help="px, of a picture 1600 px wide; default: by the seed")
     parser.add_argument("--distortion", type=float, nargs=2, metavar=("K1", "K2"), help="default: by the seed")
+    parser.add_argument("--lens-changes", action="store_true", help="autofocus and stabiliser: a lens for each photo")
     parser.add_argument("--jpeg-quality", type=int, default=91, help="of the photos (default: %(default)s)")
     parser.add_argument("--width", type=int, help="of the photos, px; 4:3 (default: 1600, with --fast 1280)")
     parser.add_argument("--passes", type=int, help="of 4 samples per pixel each (default: 2, with --fast 1)")
@@ -153,6 +158,7 @@ def _options(arguments: argparse.Namespace) -> SetOptions:
         arguments.finish,
         arguments.focal,
         tuple(arguments.distortion) if arguments.distortion else None,
+        arguments.lens_changes,
         arguments.width or (1280 if arguments.fast else 1600),
         arguments.passes or (1 if arguments.fast else 2),
         **quick,

@@ -148,8 +148,12 @@ def denoise(color, guide):
     return np.asarray(clean)
 
 
-def undistortion_maps(camera: dict, film: tuple[int, int]):
-    """Position in the undistorted film of each pixel of the distorted picture, as maps for cv2.remap."""
+def undistortion_maps(camera: dict, film: tuple[int, int], focal: float | None = None):
+    """Position in the undistorted film of each pixel of the distorted picture, as maps for cv2.remap.
+
+    The film has the camera's focal length or another one.
+    """
+    focal = focal or camera["fx"]
     u, v = np.meshgrid(np.arange(camera["width"], dtype=np.float64), np.arange(camera["height"], dtype=np.float64))
     k1, k2, *others = camera["dist"]
     assert not any(others), "only radial distortion k1, k2 is rendered"
@@ -161,8 +165,8 @@ def undistortion_maps(camera: dict, film: tuple[int, int]):
         x, y = distorted[0] / factor, distorted[1] / factor
     # The film's principal point is its middle: width / 2 counted from the edge, half a pixel less
     # counted from the middle of the first pixel.
-    map_x = x * camera["fx"] + film[0] / 2 - 0.5
-    map_y = y * camera["fx"] + film[1] / 2 - 0.5
+    map_x = x * focal + film[0] / 2 - 0.5
+    map_y = y * focal + film[1] / 2 - 0.5
     return map_x.astype(np.float32), map_y.astype(np.float32)
 
 

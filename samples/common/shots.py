@@ -65,6 +65,11 @@ def foreign_meshes(kind: Kind, seed: int, meshes, truth) -> dict:
         tx.box((34, 19, 12)),  # an offcut
         tx.revolve([(5, 0), (12, 0), (12, 4), (5, 4), (5, 0)], 40),  # a spacer ring
     ]
+    if kind.litter:
+        ring = [(5.3, 0), (10, 0), (10, 2), (5.3, 2), (5.3, 0)]
+        chip = np.column_stack([9 * np.cos(t := np.linspace(0, 5, 40)), 6 * np.sin(t), 1.5 + 0.6 * t])
+        key = tx.join(tx.box((18, 14, 2.4), (-15, 0, 1.2)), tx.box((32, 6, 2.4), (10, 0, 1.2)))
+        shapes = [tx.revolve(ring, 40), key, tx.sweep(chip, 1.4, 10), *shapes]
     for k in range(kind.foreign):
         vertices, faces = shapes[int(rng.integers(len(shapes)))]
         found[f"foreign_{k + 1}"] = _resting(vertices @ tx.turn_z(rng.uniform(0, 360)).T, next(spots)), faces
@@ -97,6 +102,17 @@ def camera(options: SetOptions) -> dict:
     focal = (options.focal_px or focal) * width / 1600
     k1, k2 = options.distortion or (k1, k2)
     return {"width": width, "height": height, "fx": focal, "fy": focal, "cx": cx, "cy": cy, "dist": [k1, k2, 0, 0, 0]}
+
+
+def camera_of_photo(options: SetOptions, index: int) -> dict:
+    """Intrinsics of one photo: those of camera.json, or changed by 0.3 % and 0.4 % of the width (1 sigma)."""
+    usual = camera(options)
+    if not options.lens_changes:
+        return usual
+    rng = np.random.default_rng((options.seed, 7, index))
+    factor, shift = 1.0 + rng.normal(0, 0.003), rng.normal(0, 0.004 * options.width, 2)
+    focal, (cx, cy) = round(usual["fx"] * factor, 3), (shift + (usual["cx"], usual["cy"])).round(3).tolist()
+    return usual | {"fx": focal, "fy": focal, "cx": cx, "cy": cy}
 
 
 def film_size(camera: dict, maps_of) -> tuple[int, int]:

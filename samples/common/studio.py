@@ -248,12 +248,14 @@ class Studio:
         self.kind, self.options = kind, options
         self.camera, self.places = shots.camera(options), shots.places(kind, options)
         film = shots.film_size(self.camera, undistortion_maps)
+        if options.lens_changes:
+            film = tuple(size + 2 * round(0.02 * options.width) for size in film)
         focus_mm = float(np.mean([distance for _, distance in kind.rings]))
         self.scene = build(kind, options, sensor(film, self.camera["fx"], APERTURE_MM, focus_mm))
         self.params = mi.traverse(self.scene)
         self.light = mi.load_dict({"type": "path", "max_depth": 4, "rr_depth": 3})
         self.guides = mi.load_dict({"type": "aov", "aovs": "alb:albedo,nn:sh_normal"})
-        self.maps = undistortion_maps(self.camera, film)
+        self.film = film
 
     def photo(self, index: int) -> tuple[np.ndarray, float]:
         """The finished BGR picture (H,W,3) uint8 and the exposure, 1 is the usual one."""
@@ -271,7 +273,8 @@ class Studio:
         guide = np.array(
             mi.render(self.scene, integrator=self.guides, spp=options.samples, seed=noise + options.passes)
         )
-        linear = cv2.remap(denoise(color, guide), *self.maps, cv2.INTER_CUBIC)
+        maps = undistortion_maps(shots.camera_of_photo(options, index), self.film, self.camera["fx"])
+        linear = cv2.remap(denoise(color, guide), *maps, cv2.INTER_CUBIC)
         fixed = self.kind.exposure if options.light == "workshop" else None
         exposure = fixed or metered(linear)
         return develop(linear, gain * exposure, rng, NOISE_GAIN.get(options.light, 1.0)), gain

@@ -170,9 +170,7 @@ def edge_offsets(
 
 def _across(camera: Camera, in_cam: Array, pixels: Array, tangents: Array) -> tuple[Array, Array]:
     """(N,2) unit normals of edges in the picture, and (N,3) px along them by mm in the camera frame."""
-    # Numerical derivative through the lens, with steps of one micrometre per mm of depth.
-    delta = 1e-6 * in_cam[:, 2:]
-    by_cam = np.stack([(camera.project(in_cam + delta * axis) - pixels) / delta for axis in np.eye(3)], axis=2)
+    by_cam = camera.slopes(in_cam)
     along = np.einsum("nij,nj->ni", by_cam, tangents)
     with np.errstate(invalid="ignore", divide="ignore"):
         along /= np.linalg.norm(along, axis=1, keepdims=True)
