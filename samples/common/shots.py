@@ -111,7 +111,8 @@ def camera_of_photo(options: SetOptions, index: int) -> dict:
         return usual
     rng = np.random.default_rng((options.seed, 7, index))
     factor, shift = 1.0 + rng.normal(0, 0.003), rng.normal(0, 0.004 * options.width, 2)
-    focal, (cx, cy) = round(usual["fx"] * factor, 3), (shift + (usual["cx"], usual["cy"])).round(3).tolist()
+    focal = round(usual["fx"] * factor, 3)
+    cx, cy = np.round(shift + np.array([usual["cx"], usual["cy"]]), 3).tolist()
     return usual | {"fx": focal, "fy": focal, "cx": cx, "cy": cy}
 
 

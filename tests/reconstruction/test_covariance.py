@@ -10,14 +10,16 @@ import pytest
 
 from arview.camera import Camera
 from arview.geometry import invert, log_se3
+from arview.reconstruction.adjustment import LensTerms, with_covariance
 from arview.reconstruction.colmap import import_pycolmap, sparse_model_of
-from arview.reconstruction.covariance import free_frame_projection, pose_covariance
+from arview.reconstruction.covariance import free_frame_projection
 from arview.reconstruction.scale.similarity import fit_points
 from arview.reconstruction.sparse import adjust
 from arview.reconstruction.types import Photo, SparseModel
 
 NOISE_PX = 0.4
 RUNS = 40
+COMMON = LensTerms(np.zeros(6, dtype=np.int64), has_centre=False)
 
 
 def synthetic_model(seed: int) -> Any:
@@ -64,9 +66,9 @@ def test_poses_scatter_as_the_covariance_says() -> None:
     errors, covariances = [], []
     for _ in range(RUNS):
         noisy = with_noise(truth_model, rng)
-        adjuster = adjust(noisy, 1, refines_centre=False)
+        adjust(noisy, 1, refines_centre=False)
         found = sparse_model_of(noisy, photos)
-        covariance = pose_covariance(found, noisy, adjuster)
+        covariance = with_covariance(found, COMMON).pose_covariance
         assert covariance is not None
         covariances.append(covariance)
         errors.append(free_frame_projection(truth) @ twists(found, truth))
@@ -80,9 +82,9 @@ def test_poses_scatter_as_the_covariance_says() -> None:
 
 def test_no_camera_is_free_of_error_by_being_held() -> None:
     model = with_noise(synthetic_model(5), np.random.default_rng(2))
-    adjuster = adjust(model, 1, refines_centre=False)
+    adjust(model, 1, refines_centre=False)
     found = sparse_model_of(model, photos_of(model))
-    covariance = pose_covariance(found, model, adjuster)
+    covariance = with_covariance(found, COMMON).pose_covariance
     assert covariance is not None
     variances = np.diag(covariance).reshape(-1, 6).sum(axis=1)
     assert variances.min() > 0.05 * variances.max()

@@ -74,7 +74,7 @@ def adjusted() -> tuple[SparseModel, Array]:
 
 def test_points_have_the_covariance_of_the_full_adjustment(monkeypatch: pytest.MonkeyPatch) -> None:
     sparse, full = adjusted()
-    monkeypatch.setattr("arview.reconstruction.covariance._noise_variance", lambda sparse: 1.0)
+    monkeypatch.setattr("arview.reconstruction.covariance.noise_variance_of", lambda sparse: 1.0)
     found = point_covariances(sparse)
     blocks = np.array([full[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] for k in range(len(found))])
     np.testing.assert_allclose(found, blocks, rtol=2e-3, atol=2e-3 * np.abs(blocks).max())

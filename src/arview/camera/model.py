@@ -87,6 +87,16 @@ class Camera:
         x, y = self.distort(x, y)
         return np.stack([self.fx * x + self.cx, self.fy * y + self.cy], axis=-1)
 
+    def slopes(self, points_in_cam: Array) -> Array:
+        """(N,2,3) derivatives of the pixels of points (N,3) in the camera frame, px by the points' unit.
+
+        Differences with steps of one millionth of the depth, through any lens.
+        """
+        delta = 1e-6 * points_in_cam[:, 2:]
+        pixels = self.project(points_in_cam)
+        moved = [(self.project(points_in_cam + delta * axis) - pixels) / delta for axis in np.eye(3)]
+        return np.stack(moved, axis=2)
+
     def distort(self, x: Array, y: Array) -> tuple[Array, Array]:
         """Distorted normalised coordinates of ideal ones (Brown 1966, OpenCV's formula; or the lens model)."""
         if self.lens is not None:

@@ -32,8 +32,7 @@ from arview.reconstruction import (
     ScaleResult,
     SparseModel,
     base_names,
-    read_reconstruction,
-    sparse_model_of,
+    read_model,
 )
 
 _NORMALS_WITHIN_MM = 3.0
@@ -86,14 +85,11 @@ def read_folder(folder: str | Path, photos: str | Path | None = None, with_cloud
         raise InputError(f"{folder}: no CAD frame, because the part was not found in the photos: {scale.why_no_frame}")
     listed = [_photo(entry, folder, photos) for entry in _read(folder / "photos.json")["photos"]]
     try:
-        sparse = sparse_model_of(read_reconstruction(folder / "sparse" / "model"), listed)
+        sparse = read_model(folder / "sparse", listed)
     except (OSError, ValueError, RuntimeError) as error:
         raise InputError(f"{folder}: the sparse model is missing or damaged ({error}); reconstruct again") from error
     if not sparse.photos:
         raise InputError(f"{folder}: the sparse model holds none of the photos; reconstruct again")
-    covariance = folder / "sparse" / "covariance.npy"
-    if covariance.is_file():
-        sparse = replace(sparse, pose_covariance=np.load(covariance))
     cloud = None
     if has_cloud:
         from arview.reconstruction import read_ply

@@ -8,9 +8,8 @@ if TYPE_CHECKING:
     from arview.reconstruction.added import AddedOptions as AddedOptions
     from arview.reconstruction.added import EarlierPhotos as EarlierPhotos
     from arview.reconstruction.colmap import import_pycolmap as import_pycolmap
-    from arview.reconstruction.colmap import read_reconstruction as read_reconstruction
-    from arview.reconstruction.colmap import sparse_model_of as sparse_model_of
     from arview.reconstruction.covariance import points_table as points_table
+    from arview.reconstruction.covariance import read_model as read_model
     from arview.reconstruction.covariance import reprojection_residuals as reprojection_residuals
     from arview.reconstruction.coverage import DIRECTION_DEG as DIRECTION_DEG
     from arview.reconstruction.coverage import DIRECTIONS_WANTED as DIRECTIONS_WANTED
@@ -77,12 +76,8 @@ __getattr__, __dir__, __all__ = lazy_door(
             "AddedOptions",
             "EarlierPhotos",
         ),
-        "colmap": (
-            "import_pycolmap",
-            "read_reconstruction",
-            "sparse_model_of",
-        ),
-        "covariance": ("points_table", "reprojection_residuals"),
+        "colmap": ("import_pycolmap",),
+        "covariance": ("points_table", "read_model", "reprojection_residuals"),
         "coverage": (
             "ComponentCoverage",
             "DIRECTIONS_WANTED",

@@ -19,9 +19,11 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from threadpoolctl import threadpool_limits
 
+from arview.camera import Camera
 from arview.core.progress import Progress
 from arview.errors import CannotMeasureError
 from arview.geometry import Array, rigid
+from arview.reconstruction.adjustment import mean_lens, with_covariance
 from arview.reconstruction.colmap import import_pycolmap, model_of_poses
 from arview.reconstruction.database import emptied, write_database, write_matches
 from arview.reconstruction.features import Features
@@ -34,10 +36,12 @@ from arview.reconstruction.sparse import (
     MIN_MATCHES,
     SparseOptions,
     color_points,
+    lens_terms,
     main_group,
     match_all_along_lines,
     moving_features,
     triangulate_and_adjust,
+    with_own_lenses,
 )
 from arview.reconstruction.types import Photo, SparseModel
 
@@ -79,7 +83,8 @@ class EarlierPhotos:
         self.whole, self.options, self.memory = whole, options, memory
         self.threads = options.sparse.threads or os.cpu_count() or 1
         given = {photo.name: photo for photo in photos}
-        self.photos = [replace(given[one.name], camera=one.camera) for one in whole.photos]
+        self.usual = None if whole.lens_stds is None else mean_lens([photo.camera for photo in whole.photos])
+        self.photos = [self._with_lens(given[one.name], one.camera) for one in whole.photos]
         found, _ = moving_features(self.photos, options.sparse, self.threads, _nothing, memory)
         self.features = [
             one.taken(~hides(index, one.points_px)) if len(one) else one for index, one in enumerate(found)
@@ -96,6 +101,12 @@ class EarlierPhotos:
             _nothing,
             memory=memory,
         )
+
+    def _with_lens(self, photo: Photo, camera: Camera) -> Photo:
+        """The photo with a known camera; with a lens of its own where lenses change from photo to photo."""
+        if self.usual is None:
+            return replace(photo, camera=camera)
+        return replace(photo, camera=camera, lens=photo.name, is_calibrated=True)
 
     def _points_of(self, index: int) -> NDArray[np.int64]:
         """(N,) the point of ``whole`` that each feature of a photo belongs to, or −1."""
@@ -172,7 +183,7 @@ class EarlierPhotos:
         device = torch_device(sparse.device)
         features = [self.memory.features(photo, sparse.features, device) for photo in photos]
         lenses = {photo.lens: photo.camera for photo in self.photos}
-        photos = [replace(photo, camera=lenses.get(photo.lens, photo.camera)) for photo in photos]
+        photos = [self._with_lens(photo, self.usual or lenses.get(photo.lens, photo.camera)) for photo in photos]
         tell("matching", 0, 1)
         placed, left_out, kept = [], [], []
         for photo, one, (points, pixels) in zip(photos, features, self.match(photos, features, poses), strict=True):
@@ -196,8 +207,11 @@ class EarlierPhotos:
             path,
             match_all_along_lines(model, joint, everything, sparse, self.threads, tell, memory=self.memory),
         )
-        model, adjuster = triangulate_and_adjust(model, path, folder, sparse, self.threads, tell, keeps_centre=True)
-        found, split = main_group(model, adjuster, joint, self.threads)
+        model, _ = triangulate_and_adjust(model, path, folder, sparse, self.threads, tell, keeps_centre=True)
+        found, split = main_group(model, False, joint, self.threads)
+        if self.usual is not None:
+            own = with_own_lenses(model, joint, self.usual)
+            found = with_covariance(own, lens_terms(model, own, False))
         color_points(model, everything)
         scale, motion = onto(found, self.whole)
         model.transform(pycolmap.Sim3d(scale, pycolmap.Rotation3d(motion[:3, :3]), motion[:3, 3]))

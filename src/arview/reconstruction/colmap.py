@@ -143,6 +143,19 @@ def sparse_model_of(
     )
 
 
+def update_model(reconstruction: Any, sparse: SparseModel) -> None:
+    """Give the calibrated photos and the points of a pycolmap reconstruction the values of ``sparse``, made of it."""
+    pycolmap = import_pycolmap()
+    images = {image.name: image for image in reconstruction.images.values()}
+    for photo in sparse.photos:
+        image = images[photo.name]
+        reconstruction.cameras[image.camera_id].params = colmap_camera(photo.camera, is_calibrated=True).params
+        reconstruction.frames[image.frame_id].rig_from_world = pycolmap.Rigid3d(photo.cam_from_scan[:3])
+    for point_id, xyz in zip(sorted(reconstruction.points3D), sparse.points_in_scan, strict=True):
+        reconstruction.points3D[point_id].xyz = xyz
+    reconstruction.update_point_3d_errors()
+
+
 def read_reconstruction(folder: Path) -> Any:
     """Read the pycolmap reconstruction in a folder."""
     return import_pycolmap().Reconstruction(str(folder))

@@ -1,60 +1,28 @@
-"""Covariance of the camera poses from bundle adjustment."""
+"""Noise of an adjustment, covariance of its points, and the motions that it leaves free."""
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
+from arview.core.atomic import replacing
 from arview.errors import CannotMeasureError
 from arview.geometry import Array, apply, skew
-from arview.reconstruction.colmap import import_pycolmap
-from arview.reconstruction.types import SparseModel
+from arview.reconstruction.colmap import read_reconstruction, sparse_model_of
+from arview.reconstruction.types import Photo, SparseModel
 
+COVARIANCES = {"pose_covariance": "covariance.npy", "lens_covariance": "lens_covariance.npy"}
+"""Files of a model's covariances."""
 LOSS_PX = 0.5
 """Residual at which Cauchy's loss of the adjustment halves the weight of an observation."""
 MAX_ABSORBED = 0.9
 """Largest share of the noise that the unknowns are taken to absorb; with more, nothing is known of it."""
-_RAD_PER_TANGENT = 2.0
-"""Rotation vector per tangent vector of Ceres, which changes a unit quaternion by half the rotation vector."""
 
 
-def pose_covariance(sparse: SparseModel, model: Any, adjuster: Any) -> Array | None:
-    """(6M,6M) covariance of the poses of ``sparse.photos``, see `SparseModel`; None if it cannot be computed.
-
-    The inverse of the adjustment's information is for observations with 1 px of noise and with three points fixed. It
-    is scaled by the noise that the residuals show, and transformed to the frame in which the cameras together vary
-    least (S-transformation, Baarda 1973), so that no camera seems more accurate because it was fixed.
-    """
-    pycolmap = import_pycolmap()
-    options = pycolmap.BACovarianceOptions(params=pycolmap.BACovarianceOptionsParams.POSES)
-    estimate = pycolmap.estimate_ba_covariance(options, model, adjuster)
-    if estimate is None:
-        return None
-    ids = {model.images[image_id].name: image_id for image_id in model.reg_image_ids()}
-    size = 6 * len(sparse.photos)
-    joint = np.zeros((size, size))
-    maps = []
-    for i, photo in enumerate(sparse.photos):
-        # COLMAP's parameters are the rotation, perturbed on the left, and the translation, perturbed by itself.
-        twist_from_tangent = np.eye(6)
-        twist_from_tangent[:3, :3] *= _RAD_PER_TANGENT
-        twist_from_tangent[3:, :3] = _RAD_PER_TANGENT * skew(photo.cam_from_scan[:3, 3])
-        maps.append(twist_from_tangent)
-        for j in range(i + 1):
-            block = estimate.get_cam_cross_cov_from_world(ids[photo.name], ids[sparse.photos[j].name])
-            if block is not None:
-                if not np.isfinite(block).all():  # photos from one and the same place leave it singular
-                    return None
-                moved = maps[i] @ np.asarray(block) @ maps[j].T
-                joint[6 * i : 6 * i + 6, 6 * j : 6 * j + 6] = moved
-                joint[6 * j : 6 * j + 6, 6 * i : 6 * i + 6] = moved.T
-    joint *= _noise_variance(sparse)
-    projection = free_frame_projection(sparse)
-    return projection @ joint @ projection.T
-
-
-def _noise_variance(sparse: SparseModel) -> float:
+def noise_variance_of(sparse: SparseModel) -> float:
     """Variance in px² by which the inverse of the adjustment's information is multiplied."""
     residuals = reprojection_residuals(sparse)
     unknowns = 3 * len(sparse.points_in_scan) + 6 * len(sparse.photos)
@@ -93,7 +61,7 @@ def point_covariances(sparse: SparseModel) -> Array:
     """
     if sparse.pose_covariance is None:
         raise CannotMeasureError("points: the covariance of the camera poses is not known, so their U is not either")
-    count, noise = len(sparse.points_in_scan), _noise_variance(sparse)
+    count, noise = len(sparse.points_in_scan), noise_variance_of(sparse)
     squares = np.sum(reprojection_residuals(sparse) ** 2, axis=1) / LOSS_PX**2
     by_point = np.empty((len(squares), 2, 3))
     by_pose = np.empty((len(squares), 2, 6))
@@ -101,11 +69,7 @@ def point_covariances(sparse: SparseModel) -> Array:
         of = np.flatnonzero(sparse.observed_photo == index)
         rotation = photo.cam_from_scan[:3, :3]
         in_cam = apply(photo.cam_from_scan, sparse.points_in_scan[sparse.observed_point[of]])
-        delta = 1e-6 * in_cam[:, 2:]
-        pixels = photo.camera.project(in_cam)
-        by_cam = np.stack(
-            [(photo.camera.project(in_cam + delta * axis) - pixels) / delta for axis in np.eye(3)], axis=2
-        )
+        by_cam = photo.camera.slopes(in_cam)
         by_point[of] = by_cam @ rotation
         by_pose[of] = np.concatenate([np.cross(in_cam[:, None], by_cam), by_cam], axis=2)
     weighed = by_point / (1.0 + squares)[:, None, None]
@@ -136,6 +100,27 @@ def points_table(sparse: SparseModel, unit: str) -> str:
         for place, sigma, number, residual in zip(sparse.points_in_scan, std, photos, rms, strict=True)
     ]
     return "\n".join([",".join([*names, "photos", "rms_px"]), *rows]) + "\n"
+
+
+def read_model(folder: Path, photos: Sequence[Photo]) -> SparseModel:
+    """The model of a ``sparse`` folder: COLMAP's, and the covariances that `write_covariances` left.
+
+    Raises:
+        OSError, ValueError, RuntimeError: a file is missing or damaged.
+    """
+    sparse = sparse_model_of(read_reconstruction(folder / "model"), photos)
+    found = {name: folder / file for name, file in COVARIANCES.items() if (folder / file).is_file()}
+    return replace(sparse, **{name: np.load(path) for name, path in found.items()})
+
+
+def write_covariances(sparse: SparseModel, folder: Path) -> None:
+    """Write the covariances that are known."""
+    for name, file in COVARIANCES.items():
+        covariance = getattr(sparse, name)
+        (folder / file).unlink(missing_ok=True)
+        if covariance is not None:
+            with replacing(folder / file) as handle:
+                np.save(handle, covariance)
 
 
 def reprojection_residuals(sparse: SparseModel) -> Array:

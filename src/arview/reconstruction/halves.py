@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -17,10 +17,18 @@ import numpy as np
 from arview.core.fits import fit_similarity
 from arview.errors import CannotMeasureError
 from arview.geometry import Array
+from arview.reconstruction.adjustment import mean_lens, with_covariance
 from arview.reconstruction.colmap import import_pycolmap, read_reconstruction, sparse_model_of
-from arview.reconstruction.covariance import pose_covariance
 from arview.reconstruction.groups import MIN_SHARED_POINTS, linked_groups
-from arview.reconstruction.sparse import MAX_ERROR_PX, MIN_ANGLE_DEG, SparseOptions, adjust, adjust_with_centre
+from arview.reconstruction.sparse import (
+    MAX_ERROR_PX,
+    MIN_ANGLE_DEG,
+    SparseOptions,
+    adjust,
+    adjust_with_centre,
+    lens_terms,
+    with_own_lenses,
+)
 from arview.reconstruction.types import Photo, PosedPhoto, SparseModel
 
 MIN_PHOTOS = 16
@@ -80,9 +88,11 @@ def adjusted_alone(
     pycolmap.ObservationManager(model).filter_all_points3D(MAX_ERROR_PX, MIN_ANGLE_DEG)
     if len(model.points3D) < MIN_SHARED_POINTS:
         raise CannotMeasureError(f"{named} share too few points")
-    adjuster = adjust(model, threads, refines_centre=refines_centre)
+    adjust(model, threads, refines_centre=refines_centre)
     sparse = sparse_model_of(model, listed)
-    sparse = replace(sparse, pose_covariance=pose_covariance(sparse, model, adjuster))
+    if whole.lens_stds is not None:
+        sparse = with_own_lenses(model, listed, mean_lens([photo.camera for photo in whole.photos]))
+    sparse = with_covariance(sparse, lens_terms(model, sparse, refines_centre))
     if len(linked_groups(sparse)) > 1:
         raise CannotMeasureError(f"{named} are not placed without the others")
     return sparse.transformed(*onto(sparse, whole))

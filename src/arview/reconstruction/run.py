@@ -34,7 +34,8 @@ from arview.core.progress import Progress
 from arview.core.stage_cache import Stages, content_key, key_of, write_json
 from arview.errors import CannotMeasureError, InputError, OutputError
 from arview.geometry import Array
-from arview.reconstruction.colmap import read_reconstruction, sparse_model_of, write_model
+from arview.reconstruction.colmap import write_model
+from arview.reconstruction.covariance import read_model, write_covariances
 from arview.reconstruction.coverage import Coverage, coverage
 from arview.reconstruction.dense import Cad, DenseOptions, read_ply, reconstruct_dense, write_ply
 from arview.reconstruction.given_poses import photos_with_poses, read_poses
@@ -64,7 +65,7 @@ STAGES: tuple[StageName, ...] = ("photos", "sparse", "scale", "dense")
 
 _RESULTS: dict[StageName, tuple[str, ...]] = {
     "photos": ("photos.json", "reconstruction.json"),
-    "sparse": ("sparse/model/*", "sparse/*.json", "sparse/covariance.npy", "sparse/points.ply"),
+    "sparse": ("sparse/model/*", "sparse/*.json", "sparse/*.npy", "sparse/points.ply"),
     "scale": ("scale.json", "metric/*"),
     "dense": ("cloud.ply",),
 }
@@ -353,9 +354,7 @@ def write_sparse(folder: Path, sparse: SparseModel) -> None:
         folder / "groups.json", {"groups": [list(one) for one in sparse.groups], "remarks": list(sparse.remarks)}
     )
     try:
-        if sparse.pose_covariance is not None:
-            with replacing(folder / "covariance.npy") as file:
-                np.save(file, sparse.pose_covariance)
+        write_covariances(sparse, folder)
         with replacing(folder / "points.ply") as file:
             file.write(points_ply(sparse))
     except OSError as error:
@@ -367,13 +366,11 @@ def _read_sparse(folder: Path, photos: tuple[Photo, ...]) -> SparseModel:
     try:
         unplaced = json.loads((folder / "unplaced.json").read_text(encoding="utf-8"))
         groups = json.loads((folder / "groups.json").read_text(encoding="utf-8"))
-        sparse = sparse_model_of(read_reconstruction(folder / "model"), photos, tuple(unplaced.items()))
+        sparse = replace(read_model(folder, photos), unplaced=tuple(unplaced.items()))
     except (OSError, ValueError, RuntimeError) as error:
         raise InputError(f"{folder}: files are missing or damaged ({error}); run again with --force") from error
     sparse = replace(sparse, groups=tuple(tuple(group) for group in groups["groups"]), remarks=tuple(groups["remarks"]))
-    sparse = with_masks_of(sparse, _read_silhouettes(folder))
-    path = folder / "covariance.npy"
-    return replace(sparse, pose_covariance=np.load(path)) if path.exists() else sparse
+    return with_masks_of(sparse, _read_silhouettes(folder))
 
 
 def _read_silhouettes(folder: Path) -> dict[str, Path]:

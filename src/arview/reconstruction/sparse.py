@@ -23,13 +23,15 @@ from arview.camera import Camera
 from arview.core.progress import Progress
 from arview.errors import CannotMeasureError
 from arview.geometry import Array, invert, skew
+from arview.reconstruction.adjustment import LensTerms, mean_lens, with_covariance, with_lens_per_photo
 from arview.reconstruction.colmap import (
     CALIBRATED_MODEL,
     import_pycolmap,
     model_of_poses,
     sparse_model_of,
+    update_model,
 )
-from arview.reconstruction.covariance import LOSS_PX, pose_covariance
+from arview.reconstruction.covariance import LOSS_PX
 from arview.reconstruction.database import emptied, write_database, write_matches
 from arview.reconstruction.features import FeatureOptions, Features, find_all_features
 from arview.reconstruction.gpu.device import torch_device
@@ -117,10 +119,12 @@ def reconstruct_sparse(
     chosen = max(models, key=lambda model: (model.num_reg_images(), model.num_points3D()))
     matches = match_all_along_lines(chosen, photos, features, options, threads, tell, min_move_px)
     write_matches(database_path, matches)
-    chosen, adjuster = triangulate_and_adjust(chosen, database_path, folder, options, threads, tell)
-    sparse, groups = _finished(chosen, adjuster, photos, features, folder, threads, models)
+    chosen, refines_centre = triangulate_and_adjust(chosen, database_path, folder, options, threads, tell)
+    sparse, groups = _finished(chosen, refines_centre, photos, features, folder, threads, models)
+    terms = lens_terms(chosen, sparse, refines_centre)
+    sparse = _lenses_of_their_own(sparse, terms, photos, features, folder, options, threads, tell)
     unplaced = unplaced_photos(photos, features, pairs, groups)
-    return replace(sparse, unplaced=tuple(unplaced), groups=groups, remarks=tuple(remarks))
+    return replace(sparse, unplaced=tuple(unplaced), groups=groups, remarks=(*remarks, *sparse.remarks))
 
 
 def reconstruct_from_poses(
@@ -155,8 +159,8 @@ def reconstruct_from_poses(
     matches = match_all_along_lines(model, photos, features, options, threads, tell)
     write_matches(database_path, matches)
     try:
-        model, adjuster = triangulate_and_adjust(model, database_path, folder, options, threads, tell)
-        sparse, groups = _finished(model, adjuster, photos, features, folder, threads, [])
+        model, refines_centre = triangulate_and_adjust(model, database_path, folder, options, threads, tell)
+        sparse, groups = _finished(model, refines_centre, photos, features, folder, threads, [])
     except (CannotMeasureError, ValueError, RuntimeError) as error:
         raise CannotMeasureError(
             "the given poses do not fit the photos: features along their epipolar lines give no points; check that the "
@@ -168,7 +172,7 @@ def reconstruct_from_poses(
 
 def _finished(
     model: Any,
-    adjuster: Any,
+    refines_centre: bool,
     photos: Sequence[Photo],
     features: Sequence[Features],
     folder: Path,
@@ -176,10 +180,77 @@ def _finished(
     models: Sequence[Any],
 ) -> tuple[SparseModel, tuple[tuple[str, ...], ...]]:
     """The main group of an adjusted model, written to the folder, and the names of all groups."""
-    sparse, split = main_group(model, adjuster, photos, threads)
+    sparse, split = main_group(model, refines_centre, photos, threads)
     color_points(model, features)
     model.write(str(emptied(folder / "model")))
     return sparse, _all_groups(sparse, split, models)
+
+
+def _lenses_of_their_own(
+    sparse: SparseModel,
+    terms: LensTerms,
+    photos: Sequence[Photo],
+    features: Sequence[Features],
+    folder: Path,
+    options: SparseOptions,
+    threads: int,
+    tell: Progress,
+) -> SparseModel:
+    """The model with a lens for each photo, where lenses change from photo to photo; otherwise as it is.
+
+    Features are matched and triangulated anew with these lenses, twice: the observations that agreed with a common lens
+    would hold the lenses near it.
+    """
+    found = with_lens_per_photo(sparse, terms)
+    if found is None:
+        return sparse
+    usual = mean_lens([photo.camera for photo in sparse.photos])
+    given = {photo.name: index for index, photo in enumerate(photos)}
+    places = [given[photo.name] for photo in sparse.photos]
+    seen = [features[place] for place in places]
+    for _ in range(2):
+        posed = [
+            (replace(photos[place], lens=one.name, camera=one.camera, is_calibrated=True), one.cam_from_scan)
+            for place, one in zip(places, found.photos, strict=True)
+        ]
+        own = [photo for photo, _ in posed]
+        path = folder / "database.db"
+        write_database(path, own, seen, {}, MIN_MATCHES, options.seed)
+        model = model_of_poses(posed)
+        write_matches(path, match_all_along_lines(model, own, seen, options, threads, tell))
+        model, _ = triangulate_and_adjust(model, path, folder, options, threads, tell, keeps_centre=True)
+        found = with_own_lenses(model, own, usual)
+    color_points(model, seen)
+    model.write(str(emptied(folder / "model")))
+    terms = lens_terms(model, found, False)
+    return replace(with_covariance(found, terms), remarks=(_lens_remark(found),))
+
+
+def with_own_lenses(model: Any, photos: Sequence[Photo], usual: Camera) -> SparseModel:
+    """A model of COLMAP's with a lens for each photo, adjusted with all of them; also in place.
+
+    Args:
+        model: whose photos have a camera each.
+        photos: of it.
+        usual: the lens around which theirs change.
+    """
+    sparse = sparse_model_of(model, photos)
+    cameras = [usual] * len(sparse.photos)
+    sparse = with_lens_per_photo(sparse, lens_terms(model, sparse, False), cameras) or sparse
+    update_model(model, sparse)
+    return sparse
+
+
+def _lens_remark(sparse: SparseModel) -> str:
+    """What is said of lenses that change from photo to photo."""
+    assert sparse.lens_stds is not None
+    side = max(sparse.photos[0].camera.width, sparse.photos[0].camera.height)
+    focal, centre = 100.0 * sparse.lens_stds[0], side * sparse.lens_stds[1]
+    return (
+        f"the lens changes from photo to photo (focal length by {focal:.2g} %, principal point by {centre:.2g} px; "
+        "standard deviations), as autofocus and stabiliser do: each photo got a lens of its own, and U is larger; fix "
+        "the focus and switch the stabiliser off where the camera lets you"
+    )
 
 
 def moving_features(
@@ -334,11 +405,11 @@ def triangulate_and_adjust(
     threads: int,
     tell: Progress,
     keeps_centre: bool = False,
-) -> tuple[Any, Any]:
+) -> tuple[Any, bool]:
     """Points triangulated from all matches; then poses, points and intrinsics adjusted together.
 
-    ``keeps_centre`` leaves principal points as an earlier adjustment has found them. Returns the model and the adjuster
-    of the last step.
+    ``keeps_centre`` leaves principal points as an earlier adjustment has found them. Returns the model and whether its
+    principal points were adjusted.
     """
     pycolmap = import_pycolmap()
     tell("adjusting", 0, 3)
@@ -355,9 +426,9 @@ def triangulate_and_adjust(
         refines_centre = adjust_with_centre(model, threads)
     tell("adjusting", 2, 3)
     pycolmap.ObservationManager(model).filter_all_points3D(MAX_ERROR_PX, MIN_ANGLE_DEG)
-    adjuster = adjust(model, threads, refines_centre=refines_centre, tolerance=LAST_TOLERANCE)
+    adjust(model, threads, refines_centre=refines_centre, tolerance=LAST_TOLERANCE)
     tell("adjusting", 3, 3)
-    return model, adjuster
+    return model, refines_centre
 
 
 def adjust_with_centre(model: Any, threads: int) -> bool:
@@ -379,7 +450,9 @@ def adjust_with_centre(model: Any, threads: int) -> bool:
     return False
 
 
-def main_group(model: Any, adjuster: Any, photos: Sequence[Photo], threads: int) -> tuple[SparseModel, list[list[str]]]:
+def main_group(
+    model: Any, refines_centre: bool, photos: Sequence[Photo], threads: int
+) -> tuple[SparseModel, list[list[str]]]:
     """The photos that are placed relative to each other, adjusted alone; and the names of the other groups.
 
     The mapper places photos by the first pass's matches; where few of them join two groups, the second pass may find
@@ -393,7 +466,7 @@ def main_group(model: Any, adjuster: Any, photos: Sequence[Photo], threads: int)
                 f"photos: the {len(sparse.photos)} that could be placed share no point seen from two sides; take more, "
                 "10 to 20 degrees apart, moving the camera sideways rather than turning it"
             )
-        sparse = replace(sparse, pose_covariance=pose_covariance(sparse, model, adjuster))
+        sparse = with_covariance(sparse, lens_terms(model, sparse, refines_centre))
         kept, *others = linked_groups(sparse)
         if len(kept) < 3:
             raise CannotMeasureError(
@@ -407,8 +480,9 @@ def main_group(model: Any, adjuster: Any, photos: Sequence[Photo], threads: int)
         for image_id in list(model.reg_image_ids()):
             if model.images[image_id].name in dropped:
                 model.deregister_frame(model.images[image_id].frame_id)
-        model.tear_down()  # without it, frames that have no pose stay, of which a covariance would be asked
-        adjuster = adjust(model, threads, refines_centre=False)
+        model.tear_down()  # without it, frames that have no pose stay
+        adjust(model, threads, refines_centre=False)
+        refines_centre = False
 
 
 def _all_groups(sparse: SparseModel, split: list[list[str]], models: Sequence[Any]) -> tuple[tuple[str, ...], ...]:
@@ -434,11 +508,19 @@ def _is_refined(camera: Any) -> bool:
     return bool(camera.model.name != CALIBRATED_MODEL)
 
 
-def adjust(model: Any, threads: int, refines_centre: bool, iterations: int = 25, tolerance: float = 1e-7) -> Any:
+def lens_terms(model: Any, sparse: SparseModel, refines_centre: bool) -> LensTerms:
+    """Which terms of the lenses of ``sparse``, a model of COLMAP's, are common unknowns."""
+    camera_of = {image.name: model.cameras[image.camera_id] for image in model.images.values()}
+    cameras = [camera_of[photo.name] for photo in sparse.photos]
+    refined = sorted({camera.camera_id for camera in cameras if _is_refined(camera)})
+    numbers = [refined.index(camera.camera_id) if _is_refined(camera) else -1 for camera in cameras]
+    return LensTerms(np.array(numbers, dtype=np.int64), refines_centre)
+
+
+def adjust(model: Any, threads: int, refines_centre: bool, iterations: int = 25, tolerance: float = 1e-7) -> None:
     """Bundle adjustment in place: poses, points, and the intrinsics of lenses that are not calibrated.
 
-    It ends after ``iterations``, or when the cost decreases by less than the share ``tolerance`` in one. Returns the
-    solved pycolmap adjuster, from which covariances can be computed.
+    It ends after ``iterations``, or when the cost decreases by less than the share ``tolerance`` in one.
     """
     pycolmap = import_pycolmap()
     options = pycolmap.BundleAdjustmentOptions(print_summary=False, refine_principal_point=refines_centre)
@@ -450,14 +532,13 @@ def adjust(model: Any, threads: int, refines_centre: bool, iterations: int = 25,
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in model.reg_image_ids():
         config.add_image(image_id)
-    config.fix_gauge(pycolmap.BundleAdjustmentGauge.THREE_POINTS)
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     for camera in model.cameras.values():
         if not _is_refined(camera):
             config.set_constant_cam_intrinsics(camera.camera_id)
     adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, model)
     adjuster.solve()
     model.update_point_3d_errors()
-    return adjuster
 
 
 def _names(model: Any) -> set[str]:

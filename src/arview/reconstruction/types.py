@@ -74,6 +74,8 @@ class SparseModel:
         remarks: what was found out about the photos, and doubts.
         pose_covariance: (6M,6M) joint covariance of the poses from bundle adjustment: for each photo a twist (rad,
             unit) applied on the left of ``cam_from_scan``, in the scan frame in which the cameras together vary least.
+        lens_covariance: (9M,9M) the same with the errors of each photo's lens after its twist: of the focal length
+            (relative) and of the principal point (by the longer side); None where photos share lenses.
     """
 
     photos: tuple[PosedPhoto, ...]
@@ -87,12 +89,26 @@ class SparseModel:
     pose_covariance: Array | None = None
     groups: tuple[tuple[str, ...], ...] = ()
     remarks: tuple[str, ...] = ()
+    lens_covariance: Array | None = None
 
     def __post_init__(self) -> None:
         if len(self.observed_point) != len(self.observed_photo) or len(self.observed_point) != len(self.observed_px):
             raise InputError("sparse model: observations of unequal length")
         if not np.isfinite(self.points_in_scan).all():
             raise InputError("sparse model: a point is NaN or infinite")
+
+    @property
+    def lens_stds(self) -> Array | None:
+        """(3,) how much the lens changes from photo to photo; None where photos share lenses.
+
+        Focal length (relative), and principal point (by the longer side of the picture).
+        """
+        cameras = [photo.camera for photo in self.photos]
+        if len({(one.fx, one.cx, one.cy) for one in cameras}) < max(3, len(cameras)):
+            return None
+        sides = np.array([max(one.width, one.height) for one in cameras])
+        focal, cx, cy = np.array([(one.fx, one.cx, one.cy) for one in cameras]).T
+        return np.array([np.std(focal) / np.mean(focal), np.std(cx / sides), np.std(cy / sides)])
 
     def transformed(self, scale: float, new_from_scan: Array) -> SparseModel:
         """The model after ``x_new = new_from_scan @ (scale * x_scan)``; scale > 0, ``new_from_scan`` (4,4) rigid."""
@@ -103,11 +119,15 @@ class SparseModel:
             scaled = rigid(photo.cam_from_scan[:3, :3], scale * photo.cam_from_scan[:3, 3])
             photos.append(replace(photo, cam_from_scan=scaled @ invert(new_from_scan)))
         points = apply(new_from_scan, scale * self.points_in_scan)
-        covariance = self.pose_covariance
-        if covariance is not None:
-            factors = np.tile([1.0, 1.0, 1.0, scale, scale, scale], len(photos))
-            covariance = covariance * np.outer(factors, factors)
-        return replace(self, photos=tuple(photos), points_in_scan=points, pose_covariance=covariance)
+        covariances = []
+        for covariance in (self.pose_covariance, self.lens_covariance):
+            if covariance is not None:
+                factors = np.ones((len(photos), len(covariance) // len(photos)))
+                factors[:, 3:6] = scale
+                covariance = covariance * np.outer(factors, factors)
+            covariances.append(covariance)
+        poses, lenses = covariances
+        return replace(self, photos=tuple(photos), points_in_scan=points, pose_covariance=poses, lens_covariance=lenses)
 
 
 @dataclass(frozen=True)

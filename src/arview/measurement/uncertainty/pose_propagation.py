@@ -20,28 +20,37 @@ DRAWN_PX = 500
 """Longer side at which the model is rendered to find out which photo shows which point."""
 
 
-def shifts_from_poses(points: Array, photos: Sequence[PosedPhoto], sees: NDArray[np.bool_]) -> Array:
-    """(N,3,6M) derivative of triangulated points (N,3) by left twists of the photos' poses.
+def shifts_from_poses(
+    points: Array, photos: Sequence[PosedPhoto], sees: NDArray[np.bool_], has_lenses: bool = False
+) -> Array:
+    """(N,3,6M) derivative of triangulated points (N,3) by left twists of the photos' poses; with lenses (N,3,9M).
 
     The pixels of a point are fixed while the poses change. With P_v the projector across its ray in view v, divided by
     the squared distance, δx = (Σ P_v)⁻¹ Σ P_v δx_v, where δx_v = −Rᵀ (ω × y + t) for the point y in the camera and a
-    twist (ω, t).
+    twist (ω, t). A change of the lens, as `SparseModel.lens_covariance` has it, turns the ray instead.
 
     Args:
         points: in the frame and unit of the poses.
         photos: M placed photos.
         sees: (N,M) which photo shows which point; points shown by fewer than two have derivative zero.
+        has_lenses: whether each photo has a lens of its own.
     """
-    count = len(photos)
-    total, parts = np.zeros((len(points), 3, 3)), np.zeros((len(points), 3, 6 * count))
+    count, size = len(photos), 9 if has_lenses else 6
+    total, parts = np.zeros((len(points), 3, 3)), np.zeros((len(points), 3, size * count))
     for view, photo in enumerate(photos):
         rotation = photo.cam_from_scan[:3, :3]
         in_cam = apply(photo.cam_from_scan, points)
         square = np.sum(in_cam**2, axis=1)
         ray = in_cam @ rotation / np.sqrt(square)[:, None]
         across = (np.eye(3) - ray[:, :, None] * ray[:, None, :]) * (sees[:, view] / square)[:, None, None]
-        by_twist = point_from_move(in_cam)[:, :, :6]
-        parts[:, :, 6 * view : 6 * view + 6] = -across @ rotation.T @ by_twist
+        by_unknown = np.zeros((len(points), 3, size))
+        by_unknown[:, :, :6] = point_from_move(in_cam)[:, :, :6]
+        if has_lenses:
+            camera, depth = photo.camera, in_cam[:, 2]
+            by_unknown[:, :2, 6] = in_cam[:, :2]
+            by_unknown[:, 0, 7] = depth * max(camera.width, camera.height) / camera.fx
+            by_unknown[:, 1, 8] = depth * max(camera.width, camera.height) / camera.fy
+        parts[:, :, size * view : size * (view + 1)] = -across @ rotation.T @ by_unknown
         total += across
     good = sees.sum(axis=1) >= 2
     parts[good] = np.linalg.solve(total[good], parts[good])
@@ -108,6 +117,8 @@ class PosePropagation:
         if sparse.pose_covariance is None:
             raise InputError("uncertainty: the reconstruction has no covariance of its poses; reconstruct again")
         self.sparse, self.model, self.alignment, self.count = sparse, model, alignment, points
+        self.has_lenses = sparse.lens_covariance is not None
+        self.covariance = sparse.pose_covariance if sparse.lens_covariance is None else sparse.lens_covariance
         self.used = used or (lambda name: np.ones(len(sparse.photos), dtype=np.bool_))
         names = base or [component.name for component in model.components]
         arms, shifts = [], []
@@ -124,8 +135,7 @@ class PosePropagation:
     def covariance_of(self, component: Component, center: Array) -> Array:
         """(6,6) covariance of a component's twist about its centre (3,), relative to the datum frame."""
         by_poses = self._twist(component, center) - self.alignment.twist_from_move(center) @ self.frame
-        assert self.sparse.pose_covariance is not None
-        return by_poses @ self.sparse.pose_covariance @ by_poses.T
+        return np.asarray(by_poses @ self.covariance @ by_poses.T)
 
     def _twist(self, component: Component, center: Array) -> Array:
         """(6,6M) derivative of a component's twist by the poses, with the change of scale removed."""
@@ -150,7 +160,7 @@ class PosePropagation:
         toward = np.mean([p.centre_in_scan for p in self.sparse.photos], axis=0) - points[some].mean(axis=0)
         facing = np.tile(toward / np.linalg.norm(toward), (len(some), 1))
         sees = visibility(points[some], facing, self.sparse, self.model) & self.used(None)
-        moved = shifts_from_poses(points[some], self.sparse.photos, sees)
+        moved = shifts_from_poses(points[some], self.sparse.photos, sees, self.has_lenses)
         apart = np.linalg.norm(points[:, None] - points[some][None], axis=2)
         apart[:, sees.sum(axis=1) < 2] = np.inf
         if not np.isfinite(apart).any():
@@ -166,5 +176,5 @@ class PosePropagation:
         sees = visibility(points, normals, self.sparse, self.model) & self.used(component.name)
         kept = np.flatnonzero(sees.sum(axis=1) >= 2)[: self.count]
         if len(kept) < 3:
-            return points[:3], np.zeros((3, 3, 6 * len(self.sparse.photos)))
-        return points[kept], shifts_from_poses(points[kept], self.sparse.photos, sees[kept])
+            return points[:3], np.zeros((3, 3, len(self.covariance)))
+        return points[kept], shifts_from_poses(points[kept], self.sparse.photos, sees[kept], self.has_lenses)

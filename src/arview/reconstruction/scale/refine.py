@@ -274,15 +274,7 @@ class JointRefiner:
         )
         offsets, slopes = choose_steps(all_offsets, all_slopes, 0.4 * reach_px, HALF_SLOPE)
         is_found = seen & (slopes != 0.0)
-        # Numerical derivative through the lens, with steps of one micrometre per mm of depth.
-        delta = 1e-6 * in_cam[:, 2:]
-        by_cam = np.stack(
-            [
-                np.sum((view.camera.project(in_cam + delta * axis) - pixels) * normals, axis=1) / delta[:, 0]
-                for axis in np.eye(3)
-            ],
-            axis=1,
-        )
+        by_cam = np.einsum("ni,nij->nj", normals, view.camera.slopes(in_cam))
         by_model = by_cam @ cam_from_model[:3, :3]
         rows = np.concatenate(
             [

@@ -115,8 +115,7 @@ def _normal_equations(
         size = np.linalg.norm(residual, axis=1)
         keep = good[which] & (size < MAX_SIGMAS * sigma_px)
         errors.append(size[keep])
-        delta = 1e-6 * in_cam[:, 2:]
-        jacobian = np.stack([(camera.project(in_cam + delta * a) - projected) / delta for a in pose[:3, :3].T], axis=2)
+        jacobian = camera.slopes(in_cam) @ pose[:3, :3]
         # Huber's weights for the standard deviation of the previous iteration.
         weights = np.where(keep, np.minimum(1.0, HUBER_SIGMAS * sigma_px / np.maximum(size, 1e-12)), 0.0)
         weighted = np.nan_to_num(jacobian * weights[:, None, None])

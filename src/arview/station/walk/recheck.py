@@ -181,10 +181,7 @@ def read_first(
         )
         entries: list[dict[str, Any]] = json.loads((folder / "photos.json").read_text(encoding="utf-8"))["photos"]
         photos = [_photo(entry, folder) for entry in entries]
-        sparse = reconstruction.sparse_model_of(reconstruction.read_reconstruction(folder / "sparse" / "model"), photos)
-        covariance = folder / "sparse" / "covariance.npy"
-        if covariance.is_file():
-            sparse = replace(sparse, pose_covariance=np.load(covariance))
+        sparse = reconstruction.read_model(folder / "sparse", photos)
     except (OSError, ValueError, RuntimeError, KeyError, TypeError) as error:
         raise InputError(f"{folder}: the first measurement is missing or damaged ({error}); measure anew") from error
     if scale.scale is None or scale.model_from_scan is None:
