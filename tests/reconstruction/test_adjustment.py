@@ -12,16 +12,16 @@ import pytest
 from arview.camera import Camera
 from arview.geometry import Array, apply, exp_se3, look_at
 from arview.measurement.uncertainty.pose_propagation import shifts_from_poses
-from arview.reconstruction.adjustment import LensTerms, mean_lens, with_covariance, with_lens_per_photo
-from arview.reconstruction.colmap import import_pycolmap, model_of_poses, sparse_model_of
-from arview.reconstruction.covariance import (
+from arview.reconstruction.adjustment.bundle import adjust
+from arview.reconstruction.adjustment.covariance import (
     LOSS_PX,
     gauge_of,
     noise_variance_of,
     point_covariances,
     reprojection_residuals,
 )
-from arview.reconstruction.sparse import adjust
+from arview.reconstruction.adjustment.equations import LensTerms, mean_lens, with_covariance, with_lens_per_photo
+from arview.reconstruction.colmap import import_pycolmap, model_of_poses, sparse_model_of
 from arview.reconstruction.types import Photo, PosedPhoto, SparseModel
 
 CAMERA = Camera(1600, 1200, 1500.0, 1500.0, 799.5, 599.5, np.array([-0.05, 0.01, 0.0, 0.0, 0.0]))

@@ -10,11 +10,11 @@ import pytest
 
 from arview.camera import Camera
 from arview.geometry import invert, log_se3
-from arview.reconstruction.adjustment import LensTerms, with_covariance
+from arview.reconstruction.adjustment.bundle import adjust
+from arview.reconstruction.adjustment.covariance import free_frame_projection
+from arview.reconstruction.adjustment.equations import LensTerms, with_covariance
 from arview.reconstruction.colmap import import_pycolmap, sparse_model_of
-from arview.reconstruction.covariance import free_frame_projection
 from arview.reconstruction.scale.similarity import fit_points
-from arview.reconstruction.sparse import adjust
 from arview.reconstruction.types import Photo, SparseModel
 
 NOISE_PX = 0.4

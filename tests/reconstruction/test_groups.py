@@ -10,7 +10,7 @@ import pytest
 
 from arview.camera import Camera
 from arview.geometry import Array, apply
-from arview.reconstruction.covariance import gauge_of
+from arview.reconstruction.adjustment.covariance import gauge_of
 from arview.reconstruction.features import FeatureOptions
 from arview.reconstruction.groups import group_names, groups_warning, linked_groups, relative_px, shared_points
 from arview.reconstruction.sparse import SparseOptions, reconstruct_sparse

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from arview.reconstruction.covariance import LOSS_PX, noise_variance
+from arview.reconstruction.adjustment.covariance import LOSS_PX, noise_variance
 
 Noise = Callable[[np.random.Generator, tuple[int, ...]], NDArray[np.float64]]
 

@@ -11,7 +11,7 @@ import pytest
 from arview.camera import Camera
 from arview.errors import CannotMeasureError
 from arview.geometry import Array, apply, exp_se3, look_at
-from arview.reconstruction.covariance import LOSS_PX, point_covariances, points_table, reprojection_residuals
+from arview.reconstruction.adjustment.covariance import LOSS_PX, point_covariances, points_table, reprojection_residuals
 from arview.reconstruction.types import PosedPhoto, SparseModel
 
 CAMERA = Camera(1600, 1200, 1500.0, 1500.0, 799.5, 599.5)
@@ -74,7 +74,7 @@ def adjusted() -> tuple[SparseModel, Array]:
 
 def test_points_have_the_covariance_of_the_full_adjustment(monkeypatch: pytest.MonkeyPatch) -> None:
     sparse, full = adjusted()
-    monkeypatch.setattr("arview.reconstruction.covariance.noise_variance_of", lambda sparse: 1.0)
+    monkeypatch.setattr("arview.reconstruction.adjustment.covariance.noise_variance_of", lambda sparse: 1.0)
     found = point_covariances(sparse)
     blocks = np.array([full[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] for k in range(len(found))])
     np.testing.assert_allclose(found, blocks, rtol=2e-3, atol=2e-3 * np.abs(blocks).max())

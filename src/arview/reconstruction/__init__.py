@@ -7,10 +7,10 @@ from arview.core.doors import lazy_door
 if TYPE_CHECKING:
     from arview.reconstruction.added import AddedOptions as AddedOptions
     from arview.reconstruction.added import EarlierPhotos as EarlierPhotos
+    from arview.reconstruction.adjustment.covariance import points_table as points_table
+    from arview.reconstruction.adjustment.covariance import read_model as read_model
+    from arview.reconstruction.adjustment.covariance import reprojection_residuals as reprojection_residuals
     from arview.reconstruction.colmap import import_pycolmap as import_pycolmap
-    from arview.reconstruction.covariance import points_table as points_table
-    from arview.reconstruction.covariance import read_model as read_model
-    from arview.reconstruction.covariance import reprojection_residuals as reprojection_residuals
     from arview.reconstruction.coverage import DIRECTION_DEG as DIRECTION_DEG
     from arview.reconstruction.coverage import DIRECTIONS_WANTED as DIRECTIONS_WANTED
     from arview.reconstruction.coverage import PHOTOS_WANTED as PHOTOS_WANTED
@@ -77,7 +77,7 @@ __getattr__, __dir__, __all__ = lazy_door(
             "EarlierPhotos",
         ),
         "colmap": ("import_pycolmap",),
-        "covariance": ("points_table", "read_model", "reprojection_residuals"),
+        "adjustment.covariance": ("points_table", "read_model", "reprojection_residuals"),
         "coverage": (
             "ComponentCoverage",
             "DIRECTIONS_WANTED",

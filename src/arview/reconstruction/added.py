@@ -23,7 +23,8 @@ from arview.camera import Camera
 from arview.core.progress import Progress
 from arview.errors import CannotMeasureError
 from arview.geometry import Array, rigid
-from arview.reconstruction.adjustment import mean_lens, with_covariance
+from arview.reconstruction.adjustment.bundle import lens_terms, with_own_lenses
+from arview.reconstruction.adjustment.equations import mean_lens, with_covariance
 from arview.reconstruction.colmap import import_pycolmap, model_of_poses
 from arview.reconstruction.database import emptied, write_database, write_matches
 from arview.reconstruction.features import Features
@@ -36,12 +37,10 @@ from arview.reconstruction.sparse import (
     MIN_MATCHES,
     SparseOptions,
     color_points,
-    lens_terms,
     main_group,
     match_all_along_lines,
     moving_features,
     triangulate_and_adjust,
-    with_own_lenses,
 )
 from arview.reconstruction.types import Photo, SparseModel
 

@@ -15,7 +15,7 @@ import scipy.sparse.csgraph
 from numpy.typing import NDArray
 
 from arview.geometry import Array
-from arview.reconstruction.covariance import gauge_of
+from arview.reconstruction.adjustment.covariance import gauge_of
 from arview.reconstruction.types import SparseModel
 
 Members = tuple[int, ...]

@@ -17,18 +17,11 @@ import numpy as np
 from arview.core.fits import fit_similarity
 from arview.errors import CannotMeasureError
 from arview.geometry import Array
-from arview.reconstruction.adjustment import mean_lens, with_covariance
+from arview.reconstruction.adjustment.bundle import adjust, adjust_with_centre, lens_terms, with_own_lenses
+from arview.reconstruction.adjustment.equations import mean_lens, with_covariance
 from arview.reconstruction.colmap import import_pycolmap, read_reconstruction, sparse_model_of
 from arview.reconstruction.groups import MIN_SHARED_POINTS, linked_groups
-from arview.reconstruction.sparse import (
-    MAX_ERROR_PX,
-    MIN_ANGLE_DEG,
-    SparseOptions,
-    adjust,
-    adjust_with_centre,
-    lens_terms,
-    with_own_lenses,
-)
+from arview.reconstruction.sparse import MAX_ERROR_PX, MIN_ANGLE_DEG, SparseOptions
 from arview.reconstruction.types import Photo, PosedPhoto, SparseModel
 
 MIN_PHOTOS = 16

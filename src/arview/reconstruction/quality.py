@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from arview.reconstruction.covariance import reprojection_residuals
+from arview.reconstruction.adjustment.covariance import reprojection_residuals
 from arview.reconstruction.types import DenseCloud, SparseModel
 
 

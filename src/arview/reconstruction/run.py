@@ -34,8 +34,8 @@ from arview.core.progress import Progress
 from arview.core.stage_cache import Stages, content_key, key_of, write_json
 from arview.errors import CannotMeasureError, InputError, OutputError
 from arview.geometry import Array
+from arview.reconstruction.adjustment.covariance import read_model, write_covariances
 from arview.reconstruction.colmap import write_model
-from arview.reconstruction.covariance import read_model, write_covariances
 from arview.reconstruction.coverage import Coverage, coverage
 from arview.reconstruction.dense import Cad, DenseOptions, read_ply, reconstruct_dense, write_ply
 from arview.reconstruction.given_poses import photos_with_poses, read_poses

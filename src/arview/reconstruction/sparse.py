@@ -23,15 +23,14 @@ from arview.camera import Camera
 from arview.core.progress import Progress
 from arview.errors import CannotMeasureError
 from arview.geometry import Array, invert, skew
-from arview.reconstruction.adjustment import LensTerms, mean_lens, with_covariance, with_lens_per_photo
+from arview.reconstruction.adjustment.bundle import adjust, adjust_with_centre, lens_terms, with_own_lenses
+from arview.reconstruction.adjustment.equations import LensTerms, mean_lens, with_covariance, with_lens_per_photo
 from arview.reconstruction.colmap import (
     CALIBRATED_MODEL,
     import_pycolmap,
     model_of_poses,
     sparse_model_of,
-    update_model,
 )
-from arview.reconstruction.covariance import LOSS_PX
 from arview.reconstruction.database import emptied, write_database, write_matches
 from arview.reconstruction.features import FeatureOptions, Features, find_all_features
 from arview.reconstruction.gpu.device import torch_device
@@ -60,10 +59,6 @@ MAX_ERROR_PX = 2.0
 """Observations with larger errors are left out of the last adjustment."""
 LAST_TOLERANCE = 1e-5
 """Relative decrease of the cost at which the last adjustment ends."""
-MIN_CENTRE_MOVE = 0.001
-"""Moves of the principal point, as a share of the longer side; smaller ones are not significant …."""
-MAX_CENTRE_MOVE = 0.05
-"""… and larger ones mean that the views do not determine it."""
 MIN_ANGLE_DEG = 1.5
 """Angle between two rays to a point; smaller ones do not determine depth."""
 
@@ -226,21 +221,6 @@ def _lenses_of_their_own(
     return replace(with_covariance(found, terms), remarks=(_lens_remark(found),))
 
 
-def with_own_lenses(model: Any, photos: Sequence[Photo], usual: Camera) -> SparseModel:
-    """A model of COLMAP's with a lens for each photo, adjusted with all of them; also in place.
-
-    Args:
-        model: whose photos have a camera each.
-        photos: of it.
-        usual: the lens around which theirs change.
-    """
-    sparse = sparse_model_of(model, photos)
-    cameras = [usual] * len(sparse.photos)
-    sparse = with_lens_per_photo(sparse, lens_terms(model, sparse, False), cameras) or sparse
-    update_model(model, sparse)
-    return sparse
-
-
 def _lens_remark(sparse: SparseModel) -> str:
     """What is said of lenses that change from photo to photo."""
     assert sparse.lens_stds is not None
@@ -327,7 +307,7 @@ def _map(path: Path, folder: Path, options: SparseOptions, photo_count: int, tel
     )
     with pycolmap.Database.open(str(path)) as database:
         cameras = database.read_all_cameras()
-    mapping.constant_cameras = {camera.camera_id for camera in cameras if not _is_refined(camera)}
+    mapping.constant_cameras = {camera.camera_id for camera in cameras if camera.model.name == CALIBRATED_MODEL}
     placed = itertools.count(3)
     tell("placing", 0, photo_count)
     models = pycolmap.incremental_mapping(
@@ -431,25 +411,6 @@ def triangulate_and_adjust(
     return model, refines_centre
 
 
-def adjust_with_centre(model: Any, threads: int) -> bool:
-    """Adjust everything including the principal points, and restore those that moved less than their uncertainty.
-
-    Returns whether the principal points are to be refined from here on. Correlated errors of features move a principal
-    point by half a pixel on good photos, and the focal length with it, so a small move is not significant.
-    """
-    before = {key: np.array(camera.params[1:3]) for key, camera in model.cameras.items() if _is_refined(camera)}
-    adjust(model, threads, refines_centre=True, iterations=12)
-    moved = [float(np.abs(model.cameras[key].params[1:3] - centre).max()) for key, centre in before.items()]
-    sizes = [max(model.cameras[key].width, model.cameras[key].height) for key in before]
-    if any(MIN_CENTRE_MOVE < move / size < MAX_CENTRE_MOVE for move, size in zip(moved, sizes, strict=True)):
-        return True
-    for key, centre in before.items():
-        model.cameras[key].params = np.concatenate(
-            [model.cameras[key].params[:1], centre, model.cameras[key].params[3:]]
-        )
-    return False
-
-
 def main_group(
     model: Any, refines_centre: bool, photos: Sequence[Photo], threads: int
 ) -> tuple[SparseModel, list[list[str]]]:
@@ -502,43 +463,6 @@ def color_points(model: Any, features: Sequence[Features]) -> None:
     for point in model.points3D.values():
         first = point.track.elements[0]
         point.color = features[first.image_id - 1].colors[first.point2D_idx]
-
-
-def _is_refined(camera: Any) -> bool:
-    return bool(camera.model.name != CALIBRATED_MODEL)
-
-
-def lens_terms(model: Any, sparse: SparseModel, refines_centre: bool) -> LensTerms:
-    """Which terms of the lenses of ``sparse``, a model of COLMAP's, are common unknowns."""
-    camera_of = {image.name: model.cameras[image.camera_id] for image in model.images.values()}
-    cameras = [camera_of[photo.name] for photo in sparse.photos]
-    refined = sorted({camera.camera_id for camera in cameras if _is_refined(camera)})
-    numbers = [refined.index(camera.camera_id) if _is_refined(camera) else -1 for camera in cameras]
-    return LensTerms(np.array(numbers, dtype=np.int64), refines_centre)
-
-
-def adjust(model: Any, threads: int, refines_centre: bool, iterations: int = 25, tolerance: float = 1e-7) -> None:
-    """Bundle adjustment in place: poses, points, and the intrinsics of lenses that are not calibrated.
-
-    It ends after ``iterations``, or when the cost decreases by less than the share ``tolerance`` in one.
-    """
-    pycolmap = import_pycolmap()
-    options = pycolmap.BundleAdjustmentOptions(print_summary=False, refine_principal_point=refines_centre)
-    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
-    options.ceres.loss_function_scale = LOSS_PX
-    options.ceres.solver_options.num_threads = threads
-    options.ceres.solver_options.max_num_iterations = iterations
-    options.ceres.solver_options.function_tolerance = tolerance
-    config = pycolmap.BundleAdjustmentConfig()
-    for image_id in model.reg_image_ids():
-        config.add_image(image_id)
-    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    for camera in model.cameras.values():
-        if not _is_refined(camera):
-            config.set_constant_cam_intrinsics(camera.camera_id)
-    adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, model)
-    adjuster.solve()
-    model.update_point_3d_errors()
 
 
 def _names(model: Any) -> set[str]:

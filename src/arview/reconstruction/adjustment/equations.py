@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from arview.camera import Camera
 from arview.geometry import Array, apply, exp_se3
-from arview.reconstruction.covariance import (
+from arview.reconstruction.adjustment.covariance import (
     LOSS_PX,
     free_frame_projection,
     gauge_of,
