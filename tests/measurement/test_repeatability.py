@@ -10,6 +10,7 @@ import pytest
 
 from arview.inspection import (
     ComponentDeviation,
+    ForeignReport,
     HalvesDifference,
     MeasuredPresence,
     Repeatability,
@@ -20,7 +21,15 @@ from arview.inspection import (
 from arview.measurement.folder import MetricReconstruction
 from arview.measurement.options import MeasureOptions
 from arview.measurement.repeatability import BUDGET_LINE, compare, measure_halves, with_repeatability
-from arview.measurement.seen_from import SeenFrom, is_mostly_hidden, seen_from, with_hidden, with_seen_from
+from arview.measurement.seen_from import (
+    MOSTLY_HIDDEN,
+    SeenFrom,
+    is_covered,
+    is_mostly_hidden,
+    seen_from,
+    with_hidden,
+    with_seen_from,
+)
 from arview.reconstruction.coverage import ComponentCoverage
 from arview.reconstruction.scale.types import Consistency, ScaleEvidence, ScaleResult
 from arview.reconstruction.types import PosedPhoto, SparseModel
@@ -107,11 +116,18 @@ def test_what_is_hidden_is_not_missing() -> None:
     """Of a part that is half covered, 40 % of the edges are found, 28 % by chance; of one that is seen, most are."""
     assert is_mostly_hidden(Consistency(True, "", 0.40, 0.28)) and not is_mostly_hidden(Consistency(True, "", 0.7, 0.2))
     assert not is_mostly_hidden(Consistency(True, ""))
-    found = with_hidden(missing("block", np.zeros(3)))
+    found = with_hidden(missing("block", np.zeros(3)), MOSTLY_HIDDEN)
     assert (found.verdict, found.finding, found.presence) == (Verdict.NOT_MEASURED, None, MeasuredPresence.NOT_SEEN)
     assert found.details is not None and "whether it is missing cannot be told" in found.details.notes[0]
     seen = measured((0.1, 0.0, 0.0))
-    assert with_hidden(seen) is seen
+    assert with_hidden(seen, MOSTLY_HIDDEN) is seen
+
+
+def test_a_component_under_a_foreign_object_is_covered() -> None:
+    washer = ForeignReport((-121.0, -116.0, 3.2), (22.0, 29.0, 3.0), 314.0, "panel", 4.7, "")
+    assert is_covered((-110.0, -118.0, 1.1), (washer,)) is True  # at its rim
+    assert is_covered((-110.0, -140.0, 1.1), (washer,)) is False
+    assert is_covered((-110.0, -118.0, 1.1), ()) is False
 
 
 @pytest.fixture(scope="module")

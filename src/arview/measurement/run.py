@@ -39,7 +39,15 @@ from arview.measurement.records import (
     in_partial_frame,
     provenance_of,
 )
-from arview.measurement.seen_from import is_mostly_hidden, seen_from, with_hidden, with_seen_from
+from arview.measurement.seen_from import (
+    MOSTLY_HIDDEN,
+    is_covered,
+    is_mostly_hidden,
+    seen_from,
+    with_covered,
+    with_hidden,
+    with_seen_from,
+)
 from arview.measurement.types import Move, NotMeasured
 from arview.measurement.uncertainty.combine import CombinedMove
 from arview.measurement.uncertainty.pose_propagation import PosePropagation
@@ -114,13 +122,16 @@ def _measure(reconstruction: MetricReconstruction, part: Part, options: MeasureO
     for done, name in enumerate(names, 1):
         record = component_record(name, results[name], measurands[name], alignment, poses, part, options)
         record = in_partial_frame(record, failed)
-        deviations.append(with_seen_from(with_hidden(record) if is_hidden else record, seen))
+        deviations.append(with_seen_from(with_hidden(record, MOSTLY_HIDDEN) if is_hidden else record, seen))
         tell("uncertainty", done, len(names))
     foreign: tuple[ForeignReport, ...] = ()
     distances: DistanceReport | None = None
     if reconstruction.cloud is not None and "cloud" in options.methods:
         tell("distance map", 0, 1)
         foreign, distances = inspect_cloud(reconstruction.cloud, part.model, alignment, deviations, options.maps_folder)
+        for index, name in enumerate(names):
+            if is_covered(part.model.component(name).centroid_in_model.tolist(), foreign):
+                deviations[index] = with_covered(deviations[index])
     return Inspection(
         part=part.name,
         serial=part.serial or "",

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from arview.cad import Model
-from arview.inspection import ComponentDeviation, Finding, MeasuredPresence, Verdict
+from arview.inspection import ComponentDeviation, Finding, ForeignReport, MeasuredPresence, Verdict
 from arview.reconstruction import DIRECTIONS_WANTED, PHOTOS_WANTED, ComponentCoverage, Consistency, SparseModel
 from arview.reconstruction.coverage import coverage
 
 HIDDEN_EDGES = 0.25
 """Share of the CAD's edges, beyond chance, below which most of the part is hidden."""
+MOSTLY_HIDDEN = "nothing of it is seen, and as most of the part is hidden, whether it is missing cannot be told"
+UNDER_FOREIGN = "nothing of it is seen, because a foreign object lies on its place; take that away and measure again"
+FOREIGN_MARGIN_MM = 4.0
+"""Margin about a foreign object in which the middle of a component is covered: its cloud ends before its rim."""
 
 
 @dataclass(frozen=True)
@@ -52,11 +58,38 @@ def is_mostly_hidden(consistency: Consistency) -> bool:
     return (share - chance) / (1.0 - min(chance, 0.95)) < HIDDEN_EDGES
 
 
-def with_hidden(record: ComponentDeviation) -> ComponentDeviation:
-    """The record of a component of a part that is mostly hidden: without a trace it is not seen, not missing."""
+def is_covered(center_mm: Sequence[float], foreign: Sequence[ForeignReport]) -> bool:
+    """Whether one of the foreign objects lies on the place of a component, with its centre in the same frame."""
+    sizes = (0.5 * np.array(one.size_mm) + FOREIGN_MARGIN_MM for one in foreign)
+    apart = (np.abs(np.array(center_mm) - one.center_mm) for one in foreign)
+    return any(bool(np.all(gap < size)) for gap, size in zip(apart, sizes, strict=True))
+
+
+def with_covered(record: ComponentDeviation) -> ComponentDeviation:
+    """The record of a component under a foreign object: what is not right there was measured on that object."""
+    if record.verdict in (Verdict.PASS, Verdict.NOT_MEASURED) or record.details is None:
+        return record
+    details = replace(record.details, notes=(UNDER_FOREIGN, *record.details.notes))
+    return replace(
+        record,
+        displacement_mm=(None, None, None),
+        distance_mm=None,
+        observable=(False,) * 6,
+        uncertainty_mm=None,
+        verdict=Verdict.NOT_MEASURED,
+        finding=None,
+        presence=MeasuredPresence.NOT_SEEN,
+        details=replace(details, measured_from_nominal=None, covariance=None),
+    )
+
+
+def with_hidden(record: ComponentDeviation, note: str) -> ComponentDeviation:
+    """The record of a component that something hides: without a trace it is not seen, not missing.
+
+    ``note`` says why.
+    """
     if record.finding is not Finding.MISSING or record.details is None:
         return record
-    note = "nothing of it is seen, and as most of the part is hidden, whether it is missing cannot be told"
     details = replace(record.details, notes=(note, *record.details.notes))
     return replace(
         record, verdict=Verdict.NOT_MEASURED, finding=None, presence=MeasuredPresence.NOT_SEEN, details=details

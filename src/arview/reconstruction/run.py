@@ -91,7 +91,7 @@ class ReconstructOptions:
     known: KnownPairs = field(
         default_factory=KnownPairs
     )  # pairs of photos to be matched, or rough poses to choose them
-    needs_scale: bool = False  # end before the cloud where nothing gives the scale, because the cloud cannot either
+    needs_scale: bool = False  # end before the cloud where nothing gives the scale
     last_stage: StageName = "dense"
     starts_over: bool = False  # discard what an earlier run left in the folder
 
@@ -205,7 +205,8 @@ class _ReconstructionRun:
             if self.options.needs_scale and scale.scale is None:
                 raise CannotMeasureError(
                     f"the part was not found in the photos: {scale.why_no_frame}. Is it this part? If it is, put a "
-                    "board or tag beside it and name it in a scale file"
+                    "board or tag beside it and name it in a scale file, or run `arview reconstruct` and `arview "
+                    "measure`, which look for its shape in the cloud"
                 )
             sparse, cad = self._metric(sparse, scale)
             cover = self._coverage(sparse, cad)

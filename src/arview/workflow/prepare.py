@@ -64,8 +64,7 @@ def prepare(job: InspectJob, folder: Path) -> Prepared:
         masks=Path(job.masks) if job.masks and job.masks != reconstruction.AUTO else None,
         silhouettes=CadSilhouettes(part) if job.masks == reconstruction.AUTO else None,
         known=reconstruction.read_pairs(job.pairs) if job.pairs else reconstruction.KnownPairs(),
-        # With two round datums their distance gives the scale of a cloud in which the part is found by its shape.
-        needs_scale=sum(datum.feature in ("hole", "pin", "cylinder") for datum in part.datums) < 2,
+        needs_scale=True,
     )
     measure = measurement.MeasureOptions(
         tolerance_mm=job.tolerance_mm,

@@ -41,7 +41,7 @@ def noise_variance(residuals: Array, absorbed: float = 0.0) -> float:
         residuals: observed minus projected.
         absorbed: number of fitted unknowns by that of coordinates: the share of the noise that they absorb.
     """
-    squares = np.sum(residuals**2, axis=1) / LOSS_PX**2
+    squares = np.sum(residuals[np.isfinite(residuals).all(axis=1)] ** 2, axis=1) / LOSS_PX**2
     weights = 1.0 / (1.0 + squares)
     slopes = np.concatenate([weights, weights - 2.0 * squares * weights**2])  # along the residual and across it
     few = 1.0 + absorbed * float(np.var(slopes) / np.mean(slopes) ** 2)

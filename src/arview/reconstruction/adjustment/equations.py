@@ -37,6 +37,8 @@ LENS_TRACK = 3
 """Photos that show a point by which lenses are found; a wrong match of two agrees with any lens it was found with."""
 POINT_ROUNDS = 3
 """Rounds in which the points of short tracks follow the lenses that the others gave."""
+MAX_LENS_STEP = 0.03
+"""Largest change of a lens in a round; more is another lens."""
 ROUNDS = 25
 """Most rounds of an adjustment, each with new weights …."""
 TOLERANCE = 5e-5
@@ -91,13 +93,15 @@ def normal_equations(sparse: SparseModel, terms: LensTerms) -> NormalEquations:
     count, photos = len(sparse.points_in_scan), len(sparse.photos)
     residuals = reprojection_residuals(sparse)
     roots = 1.0 / np.sqrt(1.0 + np.sum(residuals**2, axis=1) / LOSS_PX**2)
+    is_seen = np.isfinite(roots)  # others have their points behind the camera
+    roots, residuals = np.where(is_seen, roots, 0.0), np.where(is_seen[:, None], residuals, 0.0)
     common = int(terms.lens.max(initial=-1)) + 1
     width = UNKNOWNS * photos + 5 * common
-    by_point = np.empty((len(residuals), 2, 3))
-    by_photo = np.empty((len(residuals), 2, UNKNOWNS))
+    by_point = np.zeros((len(residuals), 2, 3))
+    by_photo = np.zeros((len(residuals), 2, UNKNOWNS))
     by_lens = np.zeros((len(residuals), 2, 5))
     for index, photo in enumerate(sparse.photos):
-        of = np.flatnonzero(sparse.observed_photo == index)
+        of = np.flatnonzero(is_seen & (sparse.observed_photo == index))
         in_cam = apply(photo.cam_from_scan, sparse.points_in_scan[sparse.observed_point[of]])
         by_cam = photo.camera.slopes(in_cam)
         root = roots[of, None, None]
@@ -208,6 +212,8 @@ def with_lens_per_photo(
         if inverse is None:
             return None
         step = inverse @ equations.right
+        if np.abs(step[own]).max() > MAX_LENS_STEP:  # another camera or zoom, which is no change of one lens
+            return None
         sparse, changes = _moved(sparse, terms, equations, step), changes + step[own]
         # Variance components: expectation and maximisation, both directions of the principal point alike.
         squares = np.mean(changes**2 + variance * np.diag(inverse)[own], axis=0)

@@ -69,6 +69,9 @@ def lenses_of(exifs: Sequence[PhotoExif], camera: str | Path | None) -> tuple[li
         warnings += [
             f"photos of {lens.key} are upright without an EXIF orientation; the calibration, rotated by 90°, is only "
             "their initial guess"
+            if lens.camera.is_distorted
+            else f"{lens.focal_from} has no terms for the distortion of the lens, so it is only an initial guess for "
+            f"the photos of {lens.key}; calibrate the camera with `arview calibrate lens`"
             for lens in lenses
             if isinstance(lens, Lens) and not lens.is_calibrated
         ]
@@ -109,7 +112,9 @@ def _new_lens(exif: PhotoExif, camera: str | Path | None, is_file: bool, taken: 
     turns = exif.quarter_turns_clockwise
     try:
         found = load_camera(camera, width, height, quarter_turns_clockwise=turns)
-        return Lens(key, brown_camera(found) or found, True, str(camera))
+        own = brown_camera(found) or found
+        # Every lens distorts a little: without terms for it, the file is a guess and no calibration.
+        return Lens(key, own, own.is_distorted, str(camera))
     except MismatchError:
         if turns % 2:
             raise
