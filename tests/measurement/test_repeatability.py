@@ -27,6 +27,7 @@ from arview.measurement.seen_from import (
     is_covered,
     is_mostly_hidden,
     seen_from,
+    with_covered,
     with_hidden,
     with_seen_from,
 )
@@ -177,3 +178,11 @@ def test_halves_of_rendered_photos_agree(reconstruction: MetricReconstruction) -
 def test_the_photos_that_show_a_component_are_counted(reconstruction: MetricReconstruction) -> None:
     seen = seen_from(reconstruction.sparse, part().model)
     assert all(len(one.photos) >= 8 for one in seen.components.values()) and len(seen.components) >= 3
+
+
+def test_what_is_not_right_under_a_foreign_object_is_not_seen() -> None:
+    seen = measured((0.1, 0.0, 0.0))
+    assert with_covered(seen) is seen and seen.verdict is Verdict.PASS
+    hidden = with_covered(missing("block", np.zeros(3)))
+    assert hidden.verdict is Verdict.NOT_MEASURED and hidden.finding is None and hidden.distance_mm is None
+    assert hidden.presence is MeasuredPresence.NOT_SEEN and "foreign object" in hidden.details.notes[0]

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from arview.cad import Model
-from arview.inspection import ComponentDeviation, Finding, ForeignReport, MeasuredPresence, Verdict
+from arview.inspection import ComponentDeviation, Details, Finding, ForeignReport, MeasuredPresence, Verdict
 from arview.reconstruction import DIRECTIONS_WANTED, PHOTOS_WANTED, ComponentCoverage, Consistency, SparseModel
 from arview.reconstruction.coverage import coverage
 
@@ -69,17 +69,17 @@ def with_covered(record: ComponentDeviation) -> ComponentDeviation:
     """The record of a component under a foreign object: what is not right there was measured on that object."""
     if record.verdict in (Verdict.PASS, Verdict.NOT_MEASURED) or record.details is None:
         return record
-    details = replace(record.details, notes=(UNDER_FOREIGN, *record.details.notes))
-    return replace(
-        record,
-        displacement_mm=(None, None, None),
-        distance_mm=None,
-        observable=(False,) * 6,
-        uncertainty_mm=None,
-        verdict=Verdict.NOT_MEASURED,
-        finding=None,
+    old = record.details
+    return ComponentDeviation(
+        record.name,
+        (None, None, None),
+        None,
+        (False,) * 6,
+        None,
+        record.tolerance_mm,
+        Verdict.NOT_MEASURED,
+        details=Details(old.center_mm, old.measurand, photos=old.photos, notes=(UNDER_FOREIGN, *old.notes)),
         presence=MeasuredPresence.NOT_SEEN,
-        details=replace(details, measured_from_nominal=None, covariance=None),
     )
 
 
