@@ -12,6 +12,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+from arview.camera.dialects import translated
 from arview.camera.entry import CameraEntry
 from arview.camera.keys import (
     CONTAINERS,
@@ -30,7 +31,7 @@ from arview.errors import InputError
 
 FORMATS = (
     "arview or BOP JSON, OpenCV YAML/XML/JSON, ROS camera_info, Kalibr camchain, COLMAP cameras.txt or .bin, Metashape "
-    "XML, RealSense JSON or nerfstudio transforms.json"
+    "XML, RealSense JSON, nerfstudio transforms.json, DepthAI, MATLAB, OpenSfM or PhotonVision JSON"
 )
 _PINHOLE = ("fx", "fy", "cx", "cy")
 _STEREO = re.compile(r"(?P<field>M|K|cameraMatrix|camera_matrix|D|distCoeffs|dist_coeffs)_?(?P<camera>[12])")
@@ -54,6 +55,7 @@ def entries_from_trees(trees: Sequence[Any], name: str = "") -> list[CameraEntry
     """
     if not trees or not all(isinstance(tree, dict | list) for tree in trees):
         raise InputError(f"is not a camera file; expected {FORMATS}")
+    trees = [translated(tree) for tree in trees]
     labels = [f"document{index + 1}" if len(trees) > 1 else "" for index in range(len(trees))]
     found = [camera for tree, label in zip(trees, labels, strict=True) for camera in _cameras(tree, label, 0)]
     if not found:

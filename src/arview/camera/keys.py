@@ -13,7 +13,7 @@ def _words(text: str) -> frozenset[str]:
 TERMS = _words("k1 k2 k3 k4 k5 k6 p1 p2 s1 s2 s3 s4 tauy taux omega xi")
 """Roles of distortion terms given one by one."""
 _NAMES_OF_ROLE = {
-    "matrix": "cameramatrix intrinsicmatrix camk k mtx intrinsics",
+    "matrix": "cameramatrix intrinsicmatrix cameraintrinsics camk k mtx intrinsics",
     "terms": "distortioncoefficients distcoeffs distcoeff distcoefs distortion dist d distortioncoeffs distortioncoeff "
     "distortionparams distortionparameters coeffs",
     "model": "distortionmodel distortiontype cameramodel cameratype lensmodel model",

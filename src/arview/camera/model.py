@@ -16,6 +16,10 @@ from arview.geometry import Array
 
 COLMAP_HALF_PX = 0.5
 """COLMAP puts (0, 0) on the corner of the first pixel, arview on its centre: added to arview's coordinates."""
+MAX_OFF_CENTRE = 0.15
+"""Distance of the principal point from the middle, by the picture's size, beyond which a camera is doubted …."""
+MAX_UNEVEN = 0.05
+"""… and relative difference of its focal lengths."""
 
 
 @dataclass(frozen=True)
@@ -76,6 +80,20 @@ class Camera:
     def is_distorted(self) -> bool:
         """True when any distortion term is not zero, or the lens has another model."""
         return self.lens is not None or bool(np.any(self.dist != 0.0))
+
+    @property
+    def doubt(self) -> str:
+        """Why the values are unlikely for pictures of this size; empty if they are not."""
+        off = max(abs((self.cx + 0.5) / self.width - 0.5), abs((self.cy + 0.5) / self.height - 0.5))
+        uneven = abs(np.log(self.fx / self.fy))
+        found = [f"the principal point ({self.cx:g}, {self.cy:g}) is {100 * off:.0f} % of the picture off its middle"]
+        found = found if off > MAX_OFF_CENTRE else []
+        found += [f"fx and fy differ by {100 * np.expm1(uneven):.0f} %"] if uneven > MAX_UNEVEN else []
+        if not found:
+            return ""
+        return (
+            f"{' and '.join(found)}: is the camera for another resolution than {self.width}×{self.height}, or a crop?"
+        )
 
     def project(self, points_in_cam: ArrayLike) -> Array:
         """Pixels (..., 2) of points (..., 3) in the camera frame; NaN for points not in front of the camera."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import click
 
 from arview import cad, guideviews
-from arview.cli.common import UNIT, main
+from arview.cli.common import UNIT, main, say
 from arview.errors import InputError
 
 
@@ -52,6 +52,8 @@ def check(part: str, unit: str | None, camera_spec: str | None, others: tuple[st
     if camera_spec is not None:
         size = (1280, 720) if camera_spec.startswith("fov:") else (None, None)
         camera = load_camera(camera_spec, *size)
+        if camera.doubt:
+            say(f"warning: camera {camera_spec}: {camera.doubt}")
     try:
         findings = guideviews.uniqueness_findings(loaded.model, loaded.effective_view_range)
     except InputError:  # a range of views that cannot be used, which the check of the part explains

@@ -322,7 +322,10 @@ def camera_for(frames: FrameSource, spec: str | None, source: str) -> Camera:
     from arview.video import load_camera_of
 
     if spec is not None:
-        return load_camera_of(frames, spec, source)
+        camera = load_camera_of(frames, spec, source)
+        if camera.doubt:
+            say(f"warning: camera {spec}: {camera.doubt}")
+        return camera
     camera = guess_camera(frames.width, frames.height)
     say(
         f"WARNING: no --camera given: GUESSING a focal length of {camera.fx:.0f} px (1.2 × the longer side)"

@@ -75,6 +75,9 @@ def lenses_of(exifs: Sequence[PhotoExif], camera: str | Path | None) -> tuple[li
             for lens in lenses
             if isinstance(lens, Lens) and not lens.is_calibrated
         ]
+        warnings += [
+            f"{lens.focal_from}: {lens.camera.doubt}" for lens in lenses if isinstance(lens, Lens) and lens.camera.doubt
+        ]
         warnings += _drop_calibration_of_other_zooms(lenses, firsts)
     return [lenses[index] for index in index_of_photo], warnings
 
