@@ -3,7 +3,8 @@
 The format is recognised by the content of the file, not by its name: arview's JSON, BOP ``camera.json`` and
 ``scene_camera.json``, OpenCV FileStorage (YAML, XML, JSON), ROS ``camera_info``, Kalibr camchain, COLMAP
 ``cameras.txt`` and ``cameras.bin``, Metashape's cameras or calibration as XML, RealSense intrinsics as JSON,
-nerfstudio ``transforms.json``, calibrations of DepthAI, MATLAB, OpenSfM and PhotonVision as JSON. Of several cameras in a file that differ, one is asked for as ``FILE:NAME``.
+nerfstudio ``transforms.json``, calibrations of DepthAI, MATLAB, OpenSfM and PhotonVision as JSON. Of several cameras
+in a file that differ, one is asked for as ``FILE:NAME``.
 ``fov:DEG``, ``exif``, ``profile`` and ``profile:NAME`` name cameras without a file.
 """
 
