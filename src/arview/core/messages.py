@@ -43,6 +43,10 @@ CATALOGUE = {
     "tracking.in_doubt": "in doubt: {names}",
     "tracking.not_verified_many": "not yet verified: {count} components",
     "tracking.not_verified": "not yet verified: {names}",
+    "tracking.focal_wrong": "the picture contradicts the focal length of the camera: {seen} px fit, {given} px were "
+    "given ({percent} %); give the camera of this mode of the lens",
+    "tracking.focal_changed": "the focal length has changed: {seen} px fit now, {given} px before ({percent} %); "
+    "zoom, lens and stabiliser must stay as they were calibrated",
     "tracking.other_first": "another part is searched for first",
     # Whether the specimen in view is the one that was measured.
     "identity.checking": "checking that this is the part that was followed before",

@@ -25,6 +25,7 @@ from arview.guideviews import GuideViewSet
 from arview.pose import Pose, TrackingState
 from arview.tracking.self_calibration.camera_estimate import CameraEstimate
 from arview.tracking.self_calibration.estimator import FocalEstimate
+from arview.tracking.self_calibration.focal_watch import FocalWatch
 from arview.tracking.session_options import SessionOptions
 from arview.tracking.several.specimens import CoveredPlace, is_same_specimen
 from arview.tracking.specimen import SpecimenTracking
@@ -98,6 +99,7 @@ class TrackingSession:
         self.specimens = tuple(specimens)
         is_estimated = is_guessed and len(parts) == 1
         self.camera_estimate = CameraEstimate(parts[0].views, camera) if is_estimated else None
+        self.focal_watch = None if is_guessed else FocalWatch(parts[0].views, camera)
         self._poses: dict[int, Pose] = {}
         self._followed_frames = [0] * len(parts)
         self._missing_frames = [0] * len(parts)
@@ -187,6 +189,8 @@ class TrackingSession:
         self._separate()
         if self.camera_estimate is not None:
             self._poses[0] = self._calibrated(image, self._poses[0], self.camera_estimate)
+        if self.focal_watch is not None:
+            self._poses[0] = self.focal_watch.judged(image, self._poses[0])
         for number, pose in self._poses.items():
             is_followed = pose.cam_from_model is not None
             self._followed_frames[number] = self._followed_frames[number] + 1 if is_followed else 0

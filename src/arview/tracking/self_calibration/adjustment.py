@@ -64,6 +64,8 @@ CENTER_SIGMA = 0.01
 """Standard deviation of the principal point before the estimation, as a share of the picture's longer side."""
 K1_SIGMA = 0.05
 """Standard deviation of the radial distortion before the estimation."""
+LINE_POINTS = 4
+"""Edge points of a line that counts."""
 MIN_POINTS = 40
 """Measured edge points that a frame must have."""
 SIGNIFICANCE = 5.0
@@ -128,6 +130,13 @@ class FocalAdjustment:
             return 0.0
         reduced, _, _, _ = self._reduced(equations)
         return float(reduced[LOG_FOCAL, LOG_FOCAL])
+
+    def lines(self, frame: CalibrationFrame, camera: Camera) -> int:
+        """Number of straight lines of the part that a frame shows with `LINE_POINTS` edge points or more."""
+        found = self._measure(frame, frame.pose_at(camera.fx), camera, SPREADS_PX[-1])
+        tangents = found.tangents.astype(np.float64)
+        labels = line_labels(found.points.astype(np.float64), tangents, self._diameter_mm, CELL_SHARE)
+        return int(np.count_nonzero(np.unique(labels, return_counts=True)[1] >= LINE_POINTS))
 
     def solve(self, frames: Sequence[CalibrationFrame], start: Camera) -> Adjusted | None:
         """Adjust the focal length and the poses of some frames, from the camera ``start``; None without an edge.

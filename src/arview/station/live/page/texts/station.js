@@ -85,6 +85,10 @@ const de = {
   "capture.hidden": "von hier verdeckt; {lacking}",
   "capture.never_seen": "andere Bauteile verdecken es aus jeder gewünschten Richtung",
   "tracking.align": "das Teil mit dem Umriss zur Deckung bringen",
+  "tracking.focal_wrong":
+    "das Bild widerspricht der Brennweite der Kamera: {seen} px passen, {given} px sind angegeben ({percent} %); Kamera dieser Betriebsart des Objektivs angeben",
+  "tracking.focal_changed":
+    "die Brennweite hat sich geändert: {seen} px passen jetzt, {given} px zuvor ({percent} %); Zoom, Objektiv und Stabilisator müssen wie bei der Kalibrierung bleiben",
   "tracking.nothing_from_to": "nichts im Bild sieht wie das Teil aus, {low} bis {high} mm entfernt",
   "tracking.outline_share": "nur {share} % des Umrisses gefunden",
   "tracking.dark": "zu dunkel",

@@ -1,0 +1,144 @@
+"""FocalWatch: whether the focal length of a given camera fits the pictures, from single frames of a tracked part.
+
+A part with depth shows the focal length in a single frame: with another one, its edges near to and far from the camera
+do not fit together. The stabilisation of a phone crops, its zoom changes lenses, and a camera file may be of another
+mode; poses then are as wrong in depth as the focal length is, although every edge lies on its line.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from arview.camera import Camera
+from arview.core.messages import Message, sentence
+from arview.guideviews import GuideViewSet
+from arview.pose import Pose, TrackingState
+from arview.refinement import PartView
+from arview.tracking.self_calibration.adjustment import FocalAdjustment
+from arview.tracking.self_calibration.frame_set import cropped_frame
+
+FIRST_EVERY, EVERY = 6, 60
+"""Frames between two looks, for the first looks and after them; a look costs as much as tracking a frame."""
+FIRST_LOOKS = 4
+"""Looks until the focal length is taken to be settled."""
+DEPTH_JUMP = 0.06
+"""Relative change of the distance between two frames after which the next one is looked at."""
+MAX_STD = 0.015
+"""Relative standard uncertainty above which a frame says too little: flat parts, and small ones."""
+MIN_DIFFERENCE, SMALL_DIFFERENCE = 0.12, 0.035
+"""Relative difference below which nothing is said; and where the frame shows `MANY_LINES` and none agreed before …."""
+CONTRADICTION = 3.5
+"""… and the same in standard uncertainties of the frame."""
+MANY_LINES = 15
+"""Lines of the part among which errors of the CAD average out: a box that is 1 % longer than its CAD shows 5 %."""
+MIN_QUALITY = 0.5
+"""Quality of a pose below which its frame is not looked at."""
+
+
+@dataclass(frozen=True)
+class FocalLook:
+    """The focal length that one frame shows.
+
+    Attributes:
+        log_ratio: logarithm of its ratio to the given one.
+        std: standard uncertainty of that.
+        lines: of the part that show it.
+    """
+
+    log_ratio: float
+    std: float
+    lines: int
+
+    def contradicts(self, is_settled: bool) -> bool:
+        """Whether the frame contradicts the given focal length; one that others agreed with needs more."""
+        least = SMALL_DIFFERENCE if self.lines >= MANY_LINES and not is_settled else MIN_DIFFERENCE
+        return abs(self.log_ratio) > max(least, CONTRADICTION * self.std)
+
+    def agrees(self, other: FocalLook) -> bool:
+        """Whether two frames show the same focal length."""
+        return abs(self.log_ratio - other.log_ratio) < max(SMALL_DIFFERENCE, CONTRADICTION * self.std)
+
+
+class FocalWatch:
+    """Watches the focal length of one camera while a part is tracked.
+
+    Two looks in a row decide, so that one frame with a wrong pose does not.
+
+    Args:
+        views: guide views of the part.
+        camera: as it was given.
+
+    Attributes:
+        contradiction: the last look, while the pictures contradict the focal length; otherwise None.
+        has_changed: whether they agreed with it before.
+    """
+
+    def __init__(self, views: GuideViewSet, camera: Camera) -> None:
+        self.contradiction: FocalLook | None = None
+        self.has_changed = False
+        self._camera = camera
+        self._part = PartView(views)
+        self._adjustment = FocalAdjustment(self._part, camera)
+        self._last: FocalLook | None = None
+        self._looks = self._wait = 0
+        self._depth_mm = 0.0
+
+    def judged(self, image: NDArray[np.uint8], pose: Pose) -> Pose:
+        """The pose of a frame (H,W,3); where the focal length is contradicted it is critical, and says by how much."""
+        self._watch(image, pose)
+        if self.contradiction is None or pose.cam_from_model is None:
+            return pose
+        state = TrackingState.CRITICAL if pose.state is TrackingState.TRACKED else pose.state
+        return replace(pose, state=state, reason=pose.reason or self.text)
+
+    @property
+    def text(self) -> Message:
+        """What is said while the focal length is contradicted."""
+        found = self.contradiction or FocalLook(0.0, 0.0, 0)
+        ratio = float(np.exp(found.log_ratio))
+        key = "tracking.focal_changed" if self.has_changed else "tracking.focal_wrong"
+        given, seen = f"{self._camera.fx:.0f}", f"{self._camera.fx * ratio:.0f}"
+        return sentence(key, given=given, seen=seen, percent=f"{100 * (ratio - 1.0):+.0f}")
+
+    def _watch(self, image: NDArray[np.uint8], pose: Pose) -> None:
+        """Look at a frame when it is its turn, or when the part seems to have jumped."""
+        self._wait -= 1
+        if pose.cam_from_model is None or pose.quality < MIN_QUALITY:
+            self._wait = min(self._wait, 1)  # what comes after a loss may be another lens
+            return
+        depth_mm = float(pose.cam_from_model[2, 3])
+        has_jumped = self._depth_mm > 0.0 and abs(np.log(depth_mm / self._depth_mm)) > DEPTH_JUMP
+        self._depth_mm = depth_mm
+        if self._wait > 0 and not has_jumped:
+            return
+        look = self._look(image, pose)
+        self._looks += 1
+        self._wait = FIRST_EVERY if self._looks < FIRST_LOOKS else EVERY
+        if look is None:
+            return
+        before, self._last = self._last, look
+        is_against = look.contradicts(self.has_changed)
+        if is_against and (before is None or not look.agrees(before)):
+            self._wait = 1  # the next frame confirms it
+            return
+        self.has_changed |= not is_against
+        self.contradiction = look if is_against else None
+
+    def _look(self, image: NDArray[np.uint8], pose: Pose) -> FocalLook | None:
+        """The focal length that a frame shows; None where it shows too little."""
+        assert pose.cam_from_model is not None
+        body = pose.cam_from_model @ self._part.model_from_body
+        frame = cropped_frame(image, body, self._camera, self._part.views.diameter_mm)
+        if frame is None:
+            return None
+        try:
+            found = self._adjustment.solve([frame], self._camera)
+        except np.linalg.LinAlgError:
+            return None
+        if found is None or found.log_focal_std > MAX_STD:
+            return None
+        log_ratio = float(np.log(found.camera.fx / self._camera.fx))
+        return FocalLook(log_ratio, found.log_focal_std, self._adjustment.lines(frame, self._camera))
