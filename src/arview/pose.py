@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from types import MappingProxyType
+from typing import Any
 
 from arview.core.messages import sentence
 from arview.geometry import Array
@@ -147,6 +148,12 @@ class Pose:
             return f"<Pose {self.index}: {self.state}>"
         x, y, z = self.cam_from_model[:3, 3]
         return f"<Pose {self.index}: {self.state}, quality {self.quality:.2f}, at {x:.1f}, {y:.1f}, {z:.1f} mm>"
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**vars(self), "components": dict(self.components)}  # a read-only view cannot be pickled or copied
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state | {"components": MappingProxyType(state["components"])})
 
     @property
     def is_label_withheld(self) -> bool:

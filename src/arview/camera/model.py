@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from arview.camera.lens import LensDistortion, undistort_by_newton
+from arview.camera.terms import lens_from_terms
 from arview.errors import InputError
 from arview.geometry import Array
 
@@ -63,6 +64,25 @@ class Camera:
             raise InputError(f"camera: image size {self.width}×{self.height} is not positive")
         if self.fx <= 0 or self.fy <= 0:
             raise InputError(f"camera: focal length fx={self.fx} fy={self.fy} px is not positive")
+
+    @classmethod
+    def from_matrix(cls, matrix: ArrayLike, size: tuple[int, int], dist: ArrayLike = ()) -> Camera:
+        """The camera of a calibration matrix and distortion terms as OpenCV gives them.
+
+        Args:
+            matrix: (3,3) K, px.
+            size: width and height of the image, px.
+            dist: 4, 5, 8, 12 or 14 terms in OpenCV's order, or none; those of a tilted sensor must be zero.
+
+        Raises:
+            InputError: another shape or number, a skew, or terms that are not supported.
+        """
+        k, terms = np.asarray(matrix, dtype=np.float64), np.asarray(dist, dtype=np.float64).ravel()
+        if k.shape != (3, 3) or abs(k[0, 1]) > 1e-3 * abs(k[0, 0]) or k[1, 0] or not np.allclose(k[2], [0, 0, 1]):
+            raise InputError(f"camera: the matrix {k.tolist()} is not fx 0 cx / 0 fy cy / 0 0 1")
+        brown, lens = lens_from_terms([], terms.tolist(), {})
+        fx, fy, cx, cy = (float(k[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2)))
+        return cls(size[0], size[1], fx, fy, cx, cy, np.array(brown), lens)
 
     def __repr__(self) -> str:
         distortion = "distorted" if self.is_distorted else "no distortion"

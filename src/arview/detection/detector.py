@@ -199,6 +199,9 @@ class Detector:
             guesses: rough poses (4,4) ``cam_from_model``; if one of them leads to the part, nothing else is searched.
             searches: indices of the only budgets that are used, so that a thorough search can be spread over several
                 frames; a result must then be as sure as one of the quick search.
+
+        Raises:
+            InputError: an image of another size or type.
         """
         pyramid = self.local.pyramid(self._picture(image))
         if found := self._detect_near(pyramid, guesses):
@@ -220,7 +223,7 @@ class Detector:
 
     def _picture(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """The image, undistorted where its lens is one that the kernels do not know."""
-        return self.frames.picture(image, 0) if self.frames.is_resampling else image
+        return self.frames.picture(np.asarray(image), 0)
 
     @property
     def wider_searches(self) -> list[int]:

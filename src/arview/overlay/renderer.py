@@ -118,6 +118,10 @@ class OverlayRenderer:
         """Height of all status lines; 0 without them."""
         return sum(part.status_height_px for part in self._layers.values())
 
+    def _knows(self, pose: Pose) -> bool:
+        """Whether a pose is of a specimen that is drawn; a pose without a name is of the only one."""
+        return len(self._layers) == 1 or pose.instance in self._layers
+
     def draw(
         self,
         image: paint.Image,
@@ -137,13 +141,16 @@ class OverlayRenderer:
             in_place: draw on the image itself, which must be writable, instead of a copy.
 
         Raises:
-            MismatchError: the image is not of the camera's size.
+            MismatchError: the image is not of the camera's size, or a pose is of no specimen that is drawn.
         """
         canvas = image if in_place else np.array(image, order="C")
         expected = (self.camera.height, self.camera.width, 3)
         if canvas.shape != expected or canvas.dtype != np.uint8:
             raise MismatchError(f"overlay: image is {canvas.dtype} {canvas.shape}, the camera expects uint8 {expected}")
-        poses = [pose] if isinstance(pose, Pose) else pose
+        poses = [pose] if isinstance(pose, Pose) else list(pose)
+        strange = [one for one in poses if not isinstance(one, Pose) or not self._knows(one)]
+        if strange:
+            raise MismatchError(f"overlay: {strange[0]!r} is no pose of {', '.join(self._layers) or 'the part'}")
         only = next(iter(self._layers.values())) if len(self._layers) == 1 else None
         drawn = [(only or self._layers[one.instance], one) for one in poses]
         frame = _unpainted(image, canvas, drawn)

@@ -9,6 +9,7 @@ tracked, once its focal length has been determined.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -104,6 +105,7 @@ class TrackingSession:
         self._followed_frames = [0] * len(parts)
         self._missing_frames = [0] * len(parts)
         self._turn = self._frames = 0
+        self._began_s: float | None = None
 
     @classmethod
     def of(
@@ -166,17 +168,22 @@ class TrackingSession:
         if number is not None or len(self.specimens) == 1:
             self.specimens[number or 0].confirm()
 
-    def process(self, image: NDArray[np.uint8], index: int, time_s: float) -> tuple[Pose, ...]:
+    def process(
+        self, image: NDArray[np.uint8], index: int | None = None, time_s: float | None = None
+    ) -> tuple[Pose, ...]:
         """Pose and state of each specimen in the next frame.
 
         Args:
             image: (H,W,3) uint8 RGB of the camera's size.
-            index: index of the frame, copied into the poses.
-            time_s: time stamp of the frame, copied into the poses.
+            index: index of the frame, copied into the poses; default: the number of frames before it.
+            time_s: time stamp of the frame, copied into the poses; default: since the first frame, by the clock.
 
         Raises:
             InputError: an image of another size or type.
         """
+        self._began_s = time.monotonic() if self._began_s is None else self._began_s
+        index = self._frames if index is None else index
+        time_s = time.monotonic() - self._began_s if time_s is None else time_s
         searched = self._searched()
         # What is tracked comes first, because it is hidden from the search.
         examined = [*(number for number, one in enumerate(self.specimens) if one.has_pose), *searched]
