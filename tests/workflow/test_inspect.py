@@ -18,12 +18,14 @@ import arview.workflow.run
 from arview.cli import ExitCode, main
 from arview.cli.exit_codes import exit_code_of
 from arview.core.stage_cache import Stages, content_key
-from arview.errors import InputError, MissingDependencyError, OutputError
+from arview.errors import InputError, MismatchError, MissingDependencyError, OutputError
 from arview.inspection import Inspection, Verdict, load_inspection
 from arview.quality.history import HistoryStore
 from arview.reconstruction.intake import Intake
 from arview.reconstruction.run import Reconstruction
+from arview.workflow import InspectJob, inspect_prepared
 from arview.workflow.lock import exclusive_access
+from arview.workflow.prepare import prepare
 from arview.workflow.progress import STEPS, ProgressEstimate, ProgressEstimator, time_text
 from helpers.cad_files import write_bench
 from helpers.inspections import deviation, inspection, not_measured
@@ -193,6 +195,8 @@ def test_nothing_is_left_of_other_inputs(bench: Bench) -> None:
     assert bench.inspect().exit_code == 3
     out = bench.folder / "out"
     assert not (out / "inspection.json").exists() and not (out / "report.html").exists()
+    assert load_inspection(out / "earlier" / "01" / "inspection.json").components[0].distance_mm == 0.1
+    assert (out / "earlier" / "01" / "report.html").is_file()  # set aside, not lost
     bench.fails = {"measure": KeyboardInterrupt()}
     assert bench.inspect().exit_code == 130 and bench.did == ["reconstruct"]
     bench.fails.clear()
@@ -217,6 +221,20 @@ def test_the_film_goes_with_the_measurement(bench: Bench) -> None:
     assert found.exit_code == 0 and "no film: clip.mp4: damaged" in found.stderr and not film.exists()
     bench.fails.clear()
     assert bench.inspect("--video", str(clip)).exit_code == 0 and bench.did == ["reconstruct", "measure", "film"]
+
+
+def test_a_verdict_that_stands_is_not_made_anew_by_other_inputs(bench: Bench) -> None:
+    out = bench.folder / "out"
+    assert bench.inspect().exit_code == 0
+    before = (out / "inspection.json").read_bytes()
+    job = InspectJob(str(bench.folder / "part.toml"), str(bench.folder / "photos"), makes_pdf=False)
+    bench.did.clear()
+    inspect_prepared(prepare(job, out), out, is_settled=True)
+    assert bench.did == [] and (out / "inspection.json").read_bytes() == before
+    (bench.folder / "part.toml").write_text(PART + "[components.block]\nposition_tolerance_mm = 0.01\n")
+    with pytest.raises(MismatchError, match="changed since the verdict"):
+        inspect_prepared(prepare(job, out), out, is_settled=True)
+    assert bench.did == [] and (out / "inspection.json").read_bytes() == before and (out / "report.html").is_file()
 
 
 def test_two_do_not_work_in_one_folder(bench: Bench) -> None:

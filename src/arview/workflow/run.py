@@ -6,6 +6,7 @@
 | ``inspection.json``, ``inspection_distances/`` | the measurement; the cloud coloured by its distance to the CAD |
 | ``report.html``, ``report.pdf`` | the report |
 | ``annotated.mp4``, ``poses.jsonl`` | the video with the measured deviations, and its poses |
+| ``earlier/NN/`` | results that were made from other inputs |
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from arview.core.checks import PATH, check_type
 from arview.core.extras import require
 from arview.core.progress import Progress
 from arview.core.stage_cache import Stages, content_key, key_of
-from arview.errors import CannotMeasureError, InputError, MismatchError, MissingDependencyError
+from arview.errors import CannotMeasureError, InputError, MismatchError, MissingDependencyError, OutputError
 from arview.inspection import Inspection, Verdict, load_inspection, overall_verdict, save_inspection, verdict_sentence
 from arview.version import __version__
 from arview.workflow.film import camera_of_video, make_film
@@ -122,6 +123,7 @@ def inspect_prepared(
     starts_over: bool = False,
     memory: reconstruction.SparseMemory | None = None,
     on_verdict: Callable[[Inspection], None] | None = None,
+    is_settled: bool = False,
 ) -> Outcome:
     """Inspect one part as `inspect_part` does, from inputs that are read and checked.
 
@@ -133,14 +135,15 @@ def inspect_prepared(
         memory: features and matches that were found while the photos came.
         on_verdict: called with the measurement in the photos, which is then made and written before the dense cloud;
             the cloud and the comparison of halves may still add to it.
+        is_settled: the folder's verdict stands: nothing is measured anew by other inputs than it was made from.
 
     Raises:
-        the same as `inspect_part`.
+        the same as `inspect_part`; MismatchError also where the verdict stands and the inputs have changed.
     """
     require("an inspection", "pycolmap", "jinja2", "markupsafe", "matplotlib")
     with exclusive_access(folder, ".lock", waits=False):
         run = _InspectionRun(prepared, folder, progress or (lambda what, done, total: None), memory)
-        return run.execute(starts_over, on_verdict)
+        return run.execute(starts_over, on_verdict, is_settled)
 
 
 class _InspectionRun:
@@ -154,13 +157,18 @@ class _InspectionRun:
         self.records: list[StageRecord] = []
         self.warnings: list[str] = []
 
-    def execute(self, starts_over: bool, on_verdict: Callable[[Inspection], None] | None = None) -> Outcome:
+    def execute(
+        self, starts_over: bool, on_verdict: Callable[[Inspection], None] | None = None, is_settled: bool = False
+    ) -> Outcome:
         """Run the stages in their order."""
         key = measurement_key(self.prepared)
         if starts_over or not self.stages.is_finished("inputs", key):
-            # Results of other inputs are removed first, so that the folder never mixes results of different inputs.
-            for name in RESULTS:
-                (self.folder / name).unlink(missing_ok=True)
+            if is_settled and (self.folder / "inspection.json").is_file():
+                raise MismatchError(
+                    "the part file, its CAD, the photos or arview itself have changed since the verdict, which is "
+                    "left as it is; measure the part again for a new one"
+                )
+            self._set_aside()
             self.stages.restart("inputs")
         self.stages.finish("inputs", key)
         if on_verdict is not None:
@@ -179,6 +187,21 @@ class _InspectionRun:
             tuple(dict.fromkeys([*self.warnings, *inspection.warnings])),
             _peak_memory_mb(),
         )
+
+    def _set_aside(self) -> None:
+        """Move results of other inputs to ``earlier/NN``, so that the folder never mixes results and loses none."""
+        old = [name for name in RESULTS if (self.folder / name).is_file()]
+        if not old:
+            return
+        aside = self.folder / "earlier"
+        try:
+            number = 1 + max((int(one.name) for one in aside.glob("[0-9]*") if one.name.isdigit()), default=0)
+            for name in old:
+                target = aside / f"{number:02d}" / name
+                target.parent.mkdir(parents=True, exist_ok=True)
+                (self.folder / name).replace(target)
+        except OSError as error:
+            raise OutputError(f"{aside}: cannot be written to ({error.strerror or error})") from error
 
     def _reconstruct(self, starts_over: bool) -> reconstruction.Reconstruction:
         prepared, job = self.prepared, self.prepared.job

@@ -20,7 +20,7 @@ from arview.core.messages import sentence
 from arview.core.progress import Progress
 from arview.errors import ArviewError, InputError, MismatchError
 from arview.inspection import Inspection, save_inspection, verdict_sentence
-from arview.quality import history
+from arview.quality import decisions, history
 from arview.station.walk.job import JobFolder
 from arview.station.walk.preparation import PhotoPreparation, photo_files, poses_of
 from arview.station.walk.records import WalkState
@@ -60,6 +60,9 @@ class WalkWorker:
             self._collect(prepared)
             self._finish(prepared)
         except ArviewError as error:
+            if self.state.stage == "done":  # a verdict stands whatever comes after it
+                self._say(cloud="failed", text=f"{self.state.text}; no cloud: {error}", step="")
+                return True
             self._say(stage="failed", text=str(error), step="")
             return False
         except Exception as error:
@@ -158,6 +161,9 @@ class WalkWorker:
             prepared, reconstruct=replace(prepared.reconstruct, known=reconstruction.KnownPairs(poses=poses_of(photos)))
         )
         was_done = self.state.stage == "done"
+        if was_done and any(one.kind == "signature" for one in decisions.log_of(self.job.path).entries()):
+            self._say(cloud="failed", text=f"{self.state.text}; no cloud: the job was signed without it", step="")
+            return
         first: list[Inspection] = []
 
         def on_verdict(inspection: Inspection) -> None:
@@ -171,7 +177,12 @@ class WalkWorker:
             self._say(stage="measuring", text=sentence("walk.measuring"), photos=len(photos), cloud="waiting")
         try:
             outcome = workflow.inspect_prepared(
-                prepared, self.job.path, progress=self._progress(), memory=self.memory, on_verdict=on_verdict
+                prepared,
+                self.job.path,
+                progress=self._progress(),
+                memory=self.memory,
+                on_verdict=on_verdict,
+                is_settled=was_done,
             )
         except ArviewError as error:
             if not first:
