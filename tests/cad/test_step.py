@@ -139,11 +139,10 @@ def test_hostile_text_is_refused_at_once(body: str, expected: str, tmp_path: Pat
 @pytest.mark.parametrize(
     ("limits", "constants", "expected"),
     [
-        (StepLimits(cpu_s=20.0), {"WALL_FACTOR": 1e-4}, "did not read it in 2[01] s"),
         (StepLimits(memory_mb=150.0), {}, "more than 0.2 GB of memory"),
         (StepLimits(), {"OUTPUT_MB": 0.0001}, "broken or truncated STEP"),
     ],
-    ids=["time", "memory", "output"],
+    ids=["memory", "output"],
 )
 def test_limits_of_the_reading_process(
     limits: StepLimits, constants: dict[str, float], expected: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -155,6 +154,18 @@ def test_limits_of_the_reading_process(
     with pytest.raises(InputError, match=expected) as caught:
         read_step(path, 0.1, 10.0, False, limits)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("code", "expected"), [(-24, "did not read it in 5 s of computing"), (-1000, "did nothing for")]
+)
+def test_a_reader_that_was_ended_says_which_limit_it_was(
+    code: int, expected: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = StepWriter().write(tmp_path / "f.step", StepBodies("fixture", FIXTURE))
+    monkeypatch.setattr("arview.cad.formats.step.run_limited", lambda *arguments: (code, ""))
+    with pytest.raises(InputError, match=expected):
+        read_step(path, 0.1, 10.0, False, StepLimits(max_cpu_s=5.0))
 
 
 def test_a_placeholder_of_the_writer_is_no_name(tmp_path: Path) -> None:

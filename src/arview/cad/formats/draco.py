@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.cad.formats.limited_process import TIMED_OUT, ProcessLimits, run_limited
+from arview.cad.formats.limited_process import HUNG, TIMED_OUT, ProcessLimits, run_limited
 from arview.cad.formats.raw import MAX_TRIANGLES
 from arview.core.extras import require
 from arview.errors import InputError
@@ -83,8 +83,10 @@ def decode_draco(
         code, printed = run_limited(_DECODE, arguments, folder, size_mb, limits)
         if code == 4:
             raise InputError(f"{path}: more than {MAX_TRIANGLES:,} triangles; decimate the mesh")
-        if code in (TIMED_OUT, -9):
-            raise InputError(f"{path}: its Draco data take more than {limits.cpu_of(size_mb):.0f} s; export it without")
+        if code in (TIMED_OUT, HUNG, -9):
+            raise InputError(
+                f"{path}: its Draco data take more than {limits.cpu_of(size_mb):.0f} s of computing; export it without"
+            )
         if code:
             reason = next(iter(printed.splitlines()[-1:]), "")[:120] if code == 3 else f"the decoder ended with {code}"
             raise InputError(f"{path}: broken or truncated Draco data ({reason}); export it again")

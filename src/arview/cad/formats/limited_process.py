@@ -5,11 +5,14 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import time
 from dataclasses import dataclass
 from pathlib import Path
 
 TIMED_OUT = -24
-"""Exit code of a process that took too much time: SIGXCPU."""
+"""Exit code of a process that computed for too long: SIGXCPU."""
+HUNG = -1000
+"""Exit code of a process that was ended because it did nothing."""
 
 # Native readers write to the terminal, reserve gigabytes or abort on malformed files.
 _LIMITED = """
@@ -27,8 +30,10 @@ except (ImportError, ValueError, OSError):
 """
 
 
-WALL_FACTOR = 4.0
-"""Seconds of waiting for one of computing, on a machine that is shared."""
+IDLE_S = 120.0
+"""Seconds in which a process that computes nothing is given up; a busy machine lets each compute a little."""
+_POLL_S = 0.5
+"""Seconds between two looks at what it has computed."""
 OUTPUT_MB = 1000.0
 """Largest file that the process may write, MB."""
 
@@ -63,7 +68,9 @@ class ProcessLimits:
 def run_limited(
     script: str, arguments: list[str], folder: Path, size_mb: float, limits: ProcessLimits
 ) -> tuple[int, str]:
-    """Run a script with limits; returns its exit code, TIMED_OUT after too much time, and what it printed.
+    """Run a script with limits; returns its exit code, TIMED_OUT or HUNG where it was ended, and what it printed.
+
+    Its limit is the time that it computes, not the time that it takes, which depends on what else the machine does.
 
     Args:
         script: Python text, whose ``sys.argv[1:]`` are the arguments.
@@ -77,17 +84,43 @@ def run_limited(
     # Without the limit each thread reserves an arena of address space, which counts as memory.
     environment = {**os.environ, "MALLOC_ARENA_MAX": "2", "OPENBLAS_NUM_THREADS": "1"}
     log = folder / "log.txt"
-    with log.open("wb") as output:
-        try:
-            code = subprocess.run(
-                [sys.executable, "-c", _LIMITED + script, *(str(int(-(-n // 1))) for n in numbers), *arguments],
-                stdin=subprocess.DEVNULL,
-                stdout=output,
-                stderr=subprocess.STDOUT,
-                env=environment,
-                timeout=WALL_FACTOR * cpu_s,
-            ).returncode
-        except subprocess.TimeoutExpired:
-            code = TIMED_OUT
+    with (
+        log.open("wb") as output,
+        subprocess.Popen(
+            [sys.executable, "-c", _LIMITED + script, *(str(int(-(-n // 1))) for n in numbers), *arguments],
+            stdin=subprocess.DEVNULL,
+            stdout=output,
+            stderr=subprocess.STDOUT,
+            env=environment,
+        ) as process,
+    ):
+        code = _waited_for(process)
     with log.open("rb") as file:
         return code, file.read(100_000).decode("utf-8", errors="replace")
+
+
+def _waited_for(process: subprocess.Popen[bytes]) -> int:
+    """Exit code of a process; HUNG after it computed nothing for `IDLE_S`. It is ended whatever happens here."""
+    computed, since_s = 0, time.monotonic()
+    try:
+        while True:
+            try:
+                return process.wait(_POLL_S)
+            except subprocess.TimeoutExpired:
+                now = _ticks(process.pid)
+            if now > computed:
+                computed, since_s = now, time.monotonic()
+            elif time.monotonic() - since_s > IDLE_S:
+                return HUNG
+    finally:
+        if process.poll() is None:
+            process.kill()
+
+
+def _ticks(pid: int) -> int:
+    """Clock ticks that a process has computed; 0 where the system does not tell."""
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text(encoding="ascii", errors="replace").rpartition(")")[2].split()
+        return int(fields[11]) + int(fields[12])
+    except (OSError, ValueError, IndexError):
+        return 0

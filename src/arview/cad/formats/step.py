@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from arview.cad.formats.gltf import parse_gltf
-from arview.cad.formats.limited_process import TIMED_OUT, ProcessLimits, run_limited
+from arview.cad.formats.limited_process import HUNG, IDLE_S, TIMED_OUT, ProcessLimits, run_limited
 from arview.cad.formats.raw import RawModel
 from arview.cad.formats.step_text import prepare_step, products_without_shape, step_unit_mm
 from arview.errors import InputError
@@ -77,6 +77,8 @@ def _triangulated(data: bytes, path: Path, tol_linear_mm: float, tol_angular_deg
         is_fine = tol_linear_mm < _USUAL_TOL_MM or tol_angular_deg < _USUAL_TOL_DEG
         code, printed = run_limited(_STEP_TO_GLB, [str(source), str(target), *numbers], folder, size_mb, limits)
         glb = target.read_bytes() if target.is_file() and code == 0 else b""
+    if code == HUNG:
+        raise InputError(f"{path}: OpenCASCADE did nothing for {IDLE_S:.0f} s and was ended; try again")
     if is_fine and (code or not glb):
         raise InputError(
             f"{path}: OpenCASCADE could not triangulate it with tol_linear_mm = {tol_linear_mm:g}, tol_angular_deg = "
