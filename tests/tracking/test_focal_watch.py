@@ -27,7 +27,7 @@ def watched(watch: FocalWatch, true: Camera, poses: list[Array], first: int = 0)
         image = picture(pose, camera=true, seed=index, scene=1, noise=3.0)
         body = pose_seen_by(pose @ part.model_from_body, true, GIVEN)
         seen = Pose(body @ part.body_from_model, np.eye(6), 0.95, TrackingState.TRACKED, index / 30.0, index)
-        found.append(watch.judged(image, seen))
+        found.append(watch.judged(image, seen, index, has_jumped=index == first))
     return found
 
 

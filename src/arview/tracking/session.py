@@ -9,6 +9,7 @@ tracked, once its focal length has been determined.
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -31,6 +32,8 @@ from arview.tracking.session_options import SessionOptions
 from arview.tracking.several.specimens import CoveredPlace, is_same_specimen
 from arview.tracking.specimen import SpecimenTracking
 
+DEPTH_JUMP = 0.06
+"""Relative change of the distance between two frames after which the focal length is looked at anew."""
 SEARCH_EVERY = 3
 """While any specimen is tracked, the others are searched for only in every n-th frame."""
 EAGER_FRAMES = 6
@@ -106,6 +109,7 @@ class TrackingSession:
         self._missing_frames = [0] * len(parts)
         self._turn = self._frames = 0
         self._began_s: float | None = None
+        self._depth_mm = 0.0
 
     @classmethod
     def of(
@@ -196,8 +200,7 @@ class TrackingSession:
         self._separate()
         if self.camera_estimate is not None:
             self._poses[0] = self._calibrated(image, self._poses[0], self.camera_estimate)
-        if self.focal_watch is not None:
-            self._poses[0] = self.focal_watch.judged(image, self._poses[0])
+        self._poses[0] = self._judged(image, self._poses[0])
         for number, pose in self._poses.items():
             is_followed = pose.cam_from_model is not None
             self._followed_frames[number] = self._followed_frames[number] + 1 if is_followed else 0
@@ -241,6 +244,17 @@ class TrackingSession:
                 estimate.replace(pose.index, camera)
         estimate.add(image, pose)
         return pose
+
+    def _judged(self, image: NDArray[np.uint8], pose: Pose) -> Pose:
+        """The pose of the first specimen, critical where the picture contradicts the focal length."""
+        watch, before_mm = self.focal_watch, self._depth_mm
+        if watch is None or pose.cam_from_model is None:
+            return pose
+        self._depth_mm = float(pose.cam_from_model[2, 3])
+        has_jumped = before_mm > 0.0 and abs(math.log(max(self._depth_mm, 1.0) / before_mm)) > DEPTH_JUMP
+        if watch.contradiction is None and not has_jumped and self._frames < watch.due:
+            return pose
+        return watch.judged(image, pose, self._frames, has_jumped)
 
     def _searched(self) -> list[int]:
         """The specimen without a pose whose turn it is to be searched for in this frame; none if all have one."""

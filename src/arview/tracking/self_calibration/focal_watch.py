@@ -24,8 +24,6 @@ FIRST_EVERY, EVERY = 6, 60
 """Frames between two looks, for the first looks and after them; a look costs as much as tracking a frame."""
 FIRST_LOOKS = 4
 """Looks until the focal length is taken to be settled."""
-DEPTH_JUMP = 0.06
-"""Relative change of the distance between two frames after which the next one is looked at."""
 MAX_STD = 0.015
 """Relative standard uncertainty above which a frame says too little: flat parts, and small ones."""
 MIN_DIFFERENCE, SMALL_DIFFERENCE = 0.12, 0.035
@@ -74,22 +72,33 @@ class FocalWatch:
     Attributes:
         contradiction: the last look, while the pictures contradict the focal length; otherwise None.
         has_changed: whether they agreed with it before.
+        due: number of frames from which on the next look is due.
     """
 
     def __init__(self, views: GuideViewSet, camera: Camera) -> None:
         self.contradiction: FocalLook | None = None
         self.has_changed = False
+        self.due = 0
         self._camera = camera
         self._part = PartView(views)
         self._adjustment = FocalAdjustment(self._part, camera)
         self._last: FocalLook | None = None
-        self._looks = self._wait = 0
-        self._depth_mm = 0.0
+        self._looks = 0
 
-    def judged(self, image: NDArray[np.uint8], pose: Pose) -> Pose:
-        """The pose of a frame (H,W,3); where the focal length is contradicted it is critical, and says by how much."""
-        self._watch(image, pose)
-        if self.contradiction is None or pose.cam_from_model is None:
+    def judged(self, image: NDArray[np.uint8], pose: Pose, frames: int, has_jumped: bool = False) -> Pose:
+        """The pose of a frame (H,W,3); where the focal length is contradicted it is critical, and says by how much.
+
+        Args:
+            image: the frame.
+            pose: of the part in it.
+            frames: number of frames so far.
+            has_jumped: the part seems to have, so that the frame is looked at before its turn.
+        """
+        if pose.cam_from_model is None:
+            return pose
+        if pose.quality >= MIN_QUALITY and (has_jumped or frames >= self.due):
+            self._watch(image, pose, frames)
+        if self.contradiction is None:
             return pose
         state = TrackingState.CRITICAL if pose.state is TrackingState.TRACKED else pose.state
         return replace(pose, state=state, reason=pose.reason or self.text)
@@ -103,26 +112,17 @@ class FocalWatch:
         given, seen = f"{self._camera.fx:.0f}", f"{self._camera.fx * ratio:.0f}"
         return sentence(key, given=given, seen=seen, percent=f"{100 * (ratio - 1.0):+.0f}")
 
-    def _watch(self, image: NDArray[np.uint8], pose: Pose) -> None:
-        """Look at a frame when it is its turn, or when the part seems to have jumped."""
-        self._wait -= 1
-        if pose.cam_from_model is None or pose.quality < MIN_QUALITY:
-            self._wait = min(self._wait, 1)  # what comes after a loss may be another lens
-            return
-        depth_mm = float(pose.cam_from_model[2, 3])
-        has_jumped = self._depth_mm > 0.0 and abs(np.log(depth_mm / self._depth_mm)) > DEPTH_JUMP
-        self._depth_mm = depth_mm
-        if self._wait > 0 and not has_jumped:
-            return
+    def _watch(self, image: NDArray[np.uint8], pose: Pose, frames: int) -> None:
+        """Look at a frame, and decide by this look and the one before."""
         look = self._look(image, pose)
         self._looks += 1
-        self._wait = FIRST_EVERY if self._looks < FIRST_LOOKS else EVERY
+        self.due = frames + (FIRST_EVERY if self._looks < FIRST_LOOKS else EVERY)
         if look is None:
             return
         before, self._last = self._last, look
         is_against = look.contradicts(self.has_changed)
         if is_against and (before is None or not look.agrees(before)):
-            self._wait = 1  # the next frame confirms it
+            self.due = frames + 1  # the next frame confirms it
             return
         self.has_changed |= not is_against
         self.contradiction = look if is_against else None
