@@ -12,7 +12,7 @@ import pytest
 from arview.camera import Camera
 from arview.geometry import Array, apply, exp_se3, look_at
 from arview.measurement.uncertainty.pose_propagation import shifts_from_poses
-from arview.reconstruction.adjustment.bundle import adjust
+from arview.reconstruction.adjustment.bundle import adjust, photos_of_two_lenses
 from arview.reconstruction.adjustment.covariance import (
     LOSS_PX,
     gauge_of,
@@ -195,6 +195,26 @@ def test_lenses_that_change_are_found_and_others_left() -> None:
     assert 0.2 < np.sqrt(np.mean((errors / std) ** 2)) < 1.3
     usual = mean_lens([one.camera for one in found.photos])
     assert usual.cx == pytest.approx(CAMERA.cx, abs=6.0) and usual.fx == pytest.approx(1500.0, rel=0.004)
+
+
+def test_two_zooms_taken_for_one_are_told() -> None:
+    noise = np.random.default_rng(5).normal(0.0, 0.2, (20000, 2))
+    lenses = [changed(0.4 * (k % 2) + 0.004 * (k % 3), 0.0, 0.0) for k in range(10)]
+    mixed = block(10, 200, noise, lenses)
+    common = changed(0.2, 0.0, 0.0)
+    photos = [Photo(one.name, one.path, 1600, 1200, "lens", common) for one in mixed.photos]
+    model, _ = colmap_model(replace(mixed, photos=tuple(replace(one, camera=common) for one in mixed.photos)))
+    adjust(model, 2, refines_centre=False, iterations=50)
+    start = sparse_model_of(model, photos)
+    terms = LensTerms(np.zeros(10, dtype=np.int64), has_centre=False)
+    found = photos_of_two_lenses(start, terms, photos)
+    assert found is not None
+    split, remark = found
+    assert [photo.lens for photo in split] == 5 * ["lens, zoom 1", "lens, zoom 2"]
+    assert split[1].camera.fx / split[0].camera.fx == pytest.approx(1.4, rel=0.03) and "two lenses or zooms" in remark
+    assert photos_of_two_lenses(start, terms, split) is None  # asked once
+    plain = block(10, 200, noise)
+    assert photos_of_two_lenses(plain, terms, photos) is None
 
 
 def test_a_point_follows_the_lenses_as_its_derivative_says() -> None:

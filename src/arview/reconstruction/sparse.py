@@ -23,8 +23,19 @@ from arview.camera import Camera
 from arview.core.progress import Progress
 from arview.errors import CannotMeasureError
 from arview.geometry import Array, invert, skew
-from arview.reconstruction.adjustment.bundle import adjust, adjust_with_centre, lens_terms, with_own_lenses
-from arview.reconstruction.adjustment.equations import LensTerms, mean_lens, with_covariance, with_lens_per_photo
+from arview.reconstruction.adjustment.bundle import (
+    adjust,
+    adjust_with_centre,
+    lens_terms,
+    photos_of_two_lenses,
+    with_own_lenses,
+)
+from arview.reconstruction.adjustment.equations import (
+    LensTerms,
+    mean_lens,
+    with_covariance,
+    with_lens_per_photo,
+)
 from arview.reconstruction.colmap import (
     CALIBRATED_MODEL,
     import_pycolmap,
@@ -117,6 +128,10 @@ def reconstruct_sparse(
     chosen, refines_centre = triangulate_and_adjust(chosen, database_path, folder, options, threads, tell)
     sparse, groups = _finished(chosen, refines_centre, photos, features, folder, threads, models)
     terms = lens_terms(chosen, sparse, refines_centre)
+    mixed = photos_of_two_lenses(sparse, terms, photos)
+    if mixed is not None:
+        found = reconstruct_sparse(mixed[0], folder, options, progress, known, memory)
+        return replace(found, remarks=(*found.remarks, mixed[1]))
     sparse = _lenses_of_their_own(sparse, terms, photos, features, folder, options, threads, tell)
     unplaced = unplaced_photos(photos, features, pairs, groups)
     return replace(sparse, unplaced=tuple(unplaced), groups=groups, remarks=(*remarks, *sparse.remarks))

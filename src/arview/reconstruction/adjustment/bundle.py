@@ -3,20 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from arview.camera import Camera
-from arview.reconstruction.adjustment.covariance import LOSS_PX
-from arview.reconstruction.adjustment.equations import LensTerms, with_lens_per_photo
+from arview.reconstruction.adjustment.covariance import LOSS_PX, noise_variance_of
+from arview.reconstruction.adjustment.equations import LensTerms, focal_groups, with_lens_per_photo
 from arview.reconstruction.colmap import CALIBRATED_MODEL, import_pycolmap, sparse_model_of, update_model
+from arview.reconstruction.groups import named
 from arview.reconstruction.types import Photo, SparseModel
 
 MIN_CENTRE_MOVE = 0.001
 """Moves of the principal point, as a share of the longer side; smaller ones are not significant …."""
 MAX_CENTRE_MOVE = 0.05
 """… and larger ones mean that the views do not determine it."""
+MIXED_PX = 0.3
+"""Noise of the features above which photos of two lenses may have been taken for one; good photos have 0.2."""
+ZOOM_WORD = ", zoom "
+"""In the name of a lens that was told from another one by its focal length."""
 
 
 def adjust(model: Any, threads: int, refines_centre: bool, iterations: int = 25, tolerance: float = 1e-7) -> None:
@@ -88,3 +94,28 @@ def with_own_lenses(model: Any, photos: Sequence[Photo], usual: Camera) -> Spars
 
 def _is_refined(camera: Any) -> bool:
     return bool(camera.model.name != CALIBRATED_MODEL)
+
+
+def photos_of_two_lenses(
+    sparse: SparseModel, terms: LensTerms, photos: Sequence[Photo]
+) -> tuple[list[Photo], str] | None:
+    """The photos with two lenses where they were taken to be of one, and what is said of that; None where it is one."""
+    if noise_variance_of(sparse) < MIXED_PX**2 or any(ZOOM_WORD in photo.lens for photo in photos):
+        return None
+    found = focal_groups(sparse, terms)
+    if found is None:
+        return None
+    groups, focals = found
+    group_of = {photo.name: one for photo, one in zip(sparse.photos, groups, strict=True)}
+    split = []
+    for photo in photos:
+        group = group_of.get(photo.name)
+        if group is None:  # it was not placed, and is tried with the lens of most
+            group = int(2 * sum(groups) > len(groups))
+        camera = replace(photo.camera, fx=focals[group], fy=focals[group])
+        split.append(replace(photo, lens=f"{photo.lens}{ZOOM_WORD}{group + 1}", camera=camera))
+    listed = [named([name for name, one in group_of.items() if one == group], 4) for group in (0, 1)]
+    return split, (
+        f"the photos are of two lenses or zooms: about {focals[0]:.0f} px ({listed[0]}) and {focals[1]:.0f} px "
+        f"({listed[1]}); each is calibrated by itself, which is less certain: take all photos with one lens"
+    )

@@ -27,6 +27,8 @@ from arview.reconstruction.adjustment.covariance import (
 )
 from arview.reconstruction.types import SparseModel
 
+ZOOM_STD, MIN_ZOOM, MIN_GROUP = 0.3, 0.08, 3
+"""Relative differences of focal lengths between lenses of one phone: expected, and least; and photos of each."""
 LENS_STD = np.array([0.003, 0.004, 0.004])
 """Usual change of a phone's lens: of its focal length, and of its principal point by the longer side of the picture."""
 MIN_LENS_STD = np.array([1e-3, 1e-3, 1e-3])
@@ -187,7 +189,7 @@ def _inverse(sparse: SparseModel, matrix: Array) -> Array | None:
 
 
 def with_lens_per_photo(
-    sparse: SparseModel, terms: LensTerms, usual: Sequence[Camera] | None = None
+    sparse: SparseModel, terms: LensTerms, usual: Sequence[Camera] | None = None, focal_std: float = float(LENS_STD[0])
 ) -> SparseModel | None:
     """The model adjusted with a lens for each photo; None where the lenses do not change from photo to photo.
 
@@ -195,10 +197,11 @@ def with_lens_per_photo(
         sparse: adjusted with common lenses, or with a lens for each photo before.
         terms: the unknowns of the common ones.
         usual: the lenses around which those of the photos are known to change; default: those of ``sparse``.
+        focal_std: expected relative change of the focal length.
     """
     photos, whole = len(sparse.photos), sparse
     sparse = of_long_tracks(sparse)
-    stds = LENS_STD
+    stds = np.array([focal_std, *LENS_STD[1:]])
     cameras = [photo.camera for photo in sparse.photos]
     changes = np.array([_change(one, other) for one, other in zip(cameras, usual or cameras, strict=True)])
     own = UNKNOWNS * np.arange(photos)[:, None] + np.arange(6, UNKNOWNS)
@@ -212,7 +215,9 @@ def with_lens_per_photo(
         if inverse is None:
             return None
         step = inverse @ equations.right
-        if np.abs(step[own]).max() > MAX_LENS_STEP:  # another camera or zoom, which is no change of one lens
+        if np.abs(step[own]).max() > max(
+            MAX_LENS_STEP, focal_std
+        ):  # another camera or zoom, which is no change of one lens
             return None
         sparse, changes = _moved(sparse, terms, equations, step), changes + step[own]
         # Variance components: expectation and maximisation, both directions of the principal point alike.
@@ -242,6 +247,27 @@ def of_long_tracks(sparse: SparseModel) -> SparseModel:
         observed_photo=sparse.observed_photo[of],
         observed_px=sparse.observed_px[of],
     )
+
+
+def focal_groups(sparse: SparseModel, terms: LensTerms) -> tuple[list[int], tuple[float, float]] | None:
+    """0 or 1 for each photo by the focal length with which it was taken, and the two, px; None where it is one.
+
+    Photos of two lenses or zooms that are adjusted as one are told by focal lengths of their own, which then lie in two
+    groups far apart.
+    """
+    if len(sparse.photos) < 2 * MIN_GROUP or (terms.lens < 0).any():
+        return None
+    found = with_lens_per_photo(sparse, terms, focal_std=ZOOM_STD)
+    if found is None:
+        return None
+    focals = np.log([photo.camera.fx for photo in found.photos])
+    order = np.sort(focals)
+    at = int(np.argmax(np.diff(order)))
+    gap, groups = float(order[at + 1] - order[at]), (order[: at + 1], order[at + 1 :])
+    if gap < MIN_ZOOM or min(map(len, groups)) < MIN_GROUP or max(map(np.ptp, groups)) > 0.5 * gap:
+        return None
+    wide, long = (float(np.exp(np.median(group))) for group in groups)
+    return [int(focal > order[at]) for focal in focals], (wide, long)
 
 
 def _change(camera: Camera, usual: Camera) -> tuple[float, float, float]:
