@@ -124,7 +124,7 @@ def load_cad(
     for component in raw.components:
         _check_finite(component, path)
     if raw.triangle_count == 0:
-        raise InputError(f"{path}: holds no triangles (empty, or points and lines only)")
+        raise InputError(f"{path}: {'; '.join(raw.notes) or 'holds no triangles (empty, or points and lines only)'}")
     factor_mm = _unit_factor(raw, path, unit)
     names, notes = unique_names([component.path for component in raw.components], path.stem)
     components, paths = [], []

@@ -12,7 +12,8 @@ import numpy as np
 from arview.cad.formats.gltf import parse_gltf
 from arview.cad.formats.limited_process import TIMED_OUT, ProcessLimits, run_limited
 from arview.cad.formats.raw import RawModel
-from arview.cad.formats.step_text import prepare_step, products_without_shape, step_unit_mm
+from arview.cad.formats.step_scene import HIDDEN
+from arview.cad.formats.step_text import prepare_step, step_unit_mm
 from arview.errors import InputError
 
 StepLimits = ProcessLimits
@@ -50,19 +51,16 @@ def read_step(
         InputError: a broken or truncated file, or one that takes too much time or memory.
     """
     data = path.read_bytes()
-    prepared = prepare_step(data, path)
+    prepared, notes = prepare_step(data, path)
     raw = parse_gltf(_triangulated(prepared, path, tol_linear_mm, tol_angular_deg, limits), path)
     raw.up = "z"
+    raw.components = [mesh for mesh in raw.components if HIDDEN not in mesh.path]
+    raw.triangle_count = sum(len(mesh.faces) for mesh in raw.components)
     factor = 1000.0 / step_unit_mm(data, path) if is_overridden else 1.0
     for index, mesh in enumerate(raw.components):
         named = tuple(name for name in mesh.path if not _PLACEHOLDER_NAME.fullmatch(name.strip()))
         raw.components[index] = replace(mesh, path=named, vertices=mesh.vertices * factor)
-    missing = products_without_shape(prepared)
-    if missing:
-        raw.notes.append(
-            f"{len(missing)} products of the STEP file have no shape in it and are left out; is it in other files? "
-            f"Export one file with all: {', '.join(missing[:4])}{' …' if len(missing) > 4 else ''}"
-        )
+    raw.notes += notes
     return raw
 
 
