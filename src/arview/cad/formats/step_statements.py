@@ -15,7 +15,7 @@ SHAPE = re.compile(
     rb"#(\d+)\s*=\s*(?:[A-Z_]+_)?SHAPE_REPRESENTATION\s*\(" + TEXT + rb",\s*\(([#\d,\s]*)\)\s*," + REF + rb"\)\s*;"
 )
 PLACEMENT = re.compile(rb"#(\d+)\s*=\s*AXIS2_PLACEMENT_3D\s*\(")
-SHAPE_OF = re.compile(rb"=\s*SHAPE_DEFINITION_REPRESENTATION\s*\(" + REF + rb"," + REF + rb"\)")
+SHAPE_OF = re.compile(rb"#\d+\s*=\s*SHAPE_DEFINITION_REPRESENTATION\s*\(" + REF + rb"," + REF + rb"\)\s*;")
 SAME_SHAPE = re.compile(
     rb"=\s*SHAPE_REPRESENTATION_RELATIONSHIP\s*\(" + TEXT + rb",[^,]*," + REF + rb"," + REF + rb"\)"
 )

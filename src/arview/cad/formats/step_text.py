@@ -12,11 +12,10 @@ from pathlib import Path
 import numpy as np
 
 from arview.cad.formats.raw import check_instance_count, short_list, unit_in_mm
+from arview.cad.formats.step_external import OtherFiles, products_without_shape
 from arview.cad.formats.step_scene import hide_bodies, name_uses
 from arview.cad.formats.step_statements import (
-    PLACEMENT,
     SHAPE,
-    SHAPE_OF,
     SOLID,
     USE,
     Products,
@@ -37,15 +36,14 @@ def prepare_step(data: bytes, path: Path) -> tuple[bytes, list[str]]:
     Raises:
         InputError: not STEP, parentheses that never close, an assembly in itself, or too many components.
     """
-    if b"ISO-10303-21" not in data[:4096]:
-        raise InputError(f"{path}: not a STEP file (ISO-10303-21 is missing at its start)")
-    _check_whole(data, path)
-    encoding = text_encoding(data)
-    if encoding != "utf-8":
-        data = decode_text(data, encoding).encode("utf-8")
+    others = OtherFiles(lambda file: _checked_text(file.read_bytes(), file))
+    data = others.added(_checked_text(data, path), path)
     _check_instances(data, path)
-    notes = []
-    if missing := products_without_shape(data):
+    notes, products = others.note(), Products(data)
+    missing = [
+        plain_name(products.name_of(one)).decode("utf-8", errors="replace") for one in products_without_shape(data)
+    ]
+    if missing := [name for name in missing if name not in others.missing]:
         notes.append(
             f"{len(missing)} products of the STEP file have no shape in it and are left out; is it in other files? "
             f"Export one file with all: {short_list(missing)}"
@@ -68,21 +66,13 @@ def step_unit_mm(data: bytes, path: Path) -> float:
     return float(next(value for value in units if value is not None))
 
 
-def products_without_shape(data: bytes) -> list[str]:
-    """Names of products that assemblies use, that hold no others, and that have no shape: it is in other files."""
-    uses = [(match[5], match[6]) for match in USE.finditer(data)]
-    if not uses:
-        return []
-    parents = {parent for parent, _ in uses}
-    placements = {m[1] for m in PLACEMENT.finditer(data)}
-    products = Products(data)
-    items = {m[1]: set(re.findall(rb"\d+", m[3])) for m in SHAPE.finditer(data)}
-    # A representation of nothing but its own frame stands for a shape in another file.
-    empty = {one for one, held in items.items() if held <= placements and one not in products.linked}
-    without_shape = {products.definition.get(m[1]) for m in SHAPE_OF.finditer(data) if m[2] in empty}
-    missing = dict.fromkeys(child for _, child in uses if child not in parents and child in without_shape)
-    texts = [products.name_of(one) for one in missing]
-    return [text[1:-1].decode("utf-8", errors="replace") for text in texts]
+def _checked_text(data: bytes, path: Path) -> bytes:
+    """The content of a STEP file in UTF-8; raises InputError when it is no STEP, or not whole."""
+    if b"ISO-10303-21" not in data[:4096]:
+        raise InputError(f"{path}: not a STEP file (ISO-10303-21 is missing at its start)")
+    _check_whole(data, path)
+    encoding = text_encoding(data)
+    return data if encoding == "utf-8" else decode_text(data, encoding).encode("utf-8")
 
 
 def _check_whole(data: bytes, path: Path) -> None:
