@@ -1,8 +1,9 @@
 """Reader of 3MF: build items and component objects as named instances, units, display colours.
 
 Source: 3MF Core Specification 1.3, Materials extension (basematerials, colorgroup), Production extension
-(``p:path``). Written because general loaders drop the names of instances. The XML is read as a stream, so that memory
-grows with the triangles alone.
+(``p:path``). What is there only for printing, as supports and the modifiers of slicers, is left out and told.
+Written because general loaders drop the names of instances. The XML is read as a stream, so that memory grows with
+the triangles alone.
 """
 
 from __future__ import annotations
@@ -23,11 +24,15 @@ from arview.cad.formats.raw import (
     RawModel,
     check_instance_count,
     check_triangle_count,
+    short_list,
     unit_in_mm,
 )
+from arview.cad.formats.slicer_config import FILES, SlicerConfig
 from arview.errors import InputError
 from arview.geometry import Array
 
+_BODIES = ("model", "surface")
+"""Types of objects that are bodies; the others are support, solidsupport and other."""
 _MAX_DEPTH = 100
 _MAX_BYTES = 2_000_000_000
 _MAX_RATIO, _RATIO_FROM_BYTES = 100, 20_000_000
@@ -45,6 +50,7 @@ class _Object:
     name: str
     mesh: RawComponent
     children: list[tuple[Key, Array]]
+    kind: str
 
 
 def read_3mf(path: Path) -> RawModel:
@@ -76,9 +82,14 @@ class _Archive:
         self.objects: dict[Key, _Object] = {}
         self.counts: dict[Key, int] = {}
         self.model = RawModel()
+        self.config = SlicerConfig()
+        self.left_out: dict[str, None] = {}
+        self.uncut: dict[str, None] = {}
 
     def read(self) -> RawModel:
-        members = [info for info in self.archive.infolist() if info.filename.lower().endswith((".model", ".rels"))]
+        members = [
+            info for info in self.archive.infolist() if info.filename.lower().endswith((".model", ".rels", ".config"))
+        ]
         unpacked, packed = (sum(getattr(info, name) for info in members) for name in ("file_size", "compress_size"))
         if unpacked > _MAX_BYTES:
             raise InputError(f"{self.path}: more than 2 GB unpacked; decimate the mesh")
@@ -92,6 +103,9 @@ class _Archive:
         for name in names:
             if name.lower().endswith(".model") and name != main:
                 self._read_part(name)
+        for name in names:
+            if name.lower() in FILES:
+                self._parse(name, self.config.start, self.config.end)
         part = self._read_part(main)
         self.model.unit_mm = unit_in_mm(part.unit)
         if self.model.unit_mm is None:
@@ -102,6 +116,12 @@ class _Archive:
             check_instance_count(total, self.path)
         for key, root_from_object, part_number in part.items:
             self._instantiate(key, root_from_object, (), part_number)
+        for told, text in (
+            (self.left_out, "left out, because they are no bodies but supports, modifiers or the like"),
+            (self.uncut, "the slicer cuts these out, which is not done here; export the body that is cut"),
+        ):
+            if told:
+                self.model.notes.append(f"{text}: {short_list(list(told))}")
         return self.model
 
     def _main_part(self, names: list[str]) -> str:
@@ -152,11 +172,27 @@ class _Archive:
 
     def _instantiate(self, key: Key, root_from_object: Array, path: tuple[str, ...], name: str | None) -> None:
         this = self.objects[key]
-        here = (*path, name or this.name)
-        if len(this.mesh.faces):
-            self.model.add(replace(this.mesh, path=tuple(n for n in here if n)), self.path, root_from_object)
+        own_name = name or this.name or self.config.names.get(key[1], "")
+        if this.kind not in _BODIES:
+            self.left_out[f"{own_name or key[1]} ({this.kind})"] = None
+            return
+        here = (*path, own_name)
+        volumes = self.config.volumes.get(key[1], [])
+        others = [volume for volume in volumes if not volume.is_body]
+        for volume in others:
+            told = self.uncut if volume.is_cutter else self.left_out
+            told[f"{volume.name or 'unnamed'} ({volume.kind})"] = None
+        faces = this.mesh.faces
+        for volume in sorted(others, key=lambda one: -one.first):
+            faces = np.delete(faces, slice(max(volume.first, 0), max(volume.last + 1, 0)), axis=0)
+        if len(faces):
+            mesh = replace(this.mesh, path=tuple(n for n in here if n), faces=faces)
+            self.model.add(mesh, self.path, root_from_object)
+        parts = {volume.component: volume for volume in volumes if volume.component}
         for child, object_from_child in this.children:
-            self._instantiate(child, root_from_object @ object_from_child, here, None)
+            part = parts.get(child[1])
+            if part is None or part.is_body:
+                self._instantiate(child, root_from_object @ object_from_child, here, part.name if part else None)
 
 
 class _ModelPart:
@@ -211,8 +247,6 @@ class _ModelPart:
         if tag != "object" or self.attributes is None:
             return
         attributes, self.attributes = self.attributes, None
-        if attributes.get("type", "model") in ("support", "other"):
-            return
         vertices = np.array(self.points, dtype=np.float64).reshape(-1, 3)
         faces = np.array(self.corners, dtype=np.int64).reshape(-1, 3)
         group, index = max(self.uses, key=lambda key: self.uses[key]) if self.uses else (None, None)
@@ -221,6 +255,7 @@ class _ModelPart:
             name=attributes.get("name") or attributes.get("partnumber") or "",
             mesh=RawComponent((), vertices, faces, color),
             children=self.children,
+            kind=attributes.get("type", "model"),
         )
         self._clear()
 
