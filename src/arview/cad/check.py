@@ -16,6 +16,7 @@ from arview.cad.fitness import MeshFitness, inspect_mesh
 from arview.cad.model import Component
 from arview.cad.part import ComponentSettings, Part
 from arview.cad.shape.equal_shapes import ShapeSymmetries
+from arview.cad.shape.hidden_components import hidden_components
 from arview.cad.shape.symmetry import FoundSymmetry, Symmetry, find_symmetries
 from arview.cad.tolerance_check import tolerance_remarks, untold_tolerances
 from arview.cad.view_range import ViewRange
@@ -209,6 +210,7 @@ def check_part(part: Part, camera: Camera | None = None) -> PartCheck:
         text = f"own symmetries were not searched, to save time, of {len(shapes.skipped)} components: "
         findings.append(PartFinding("note", text + listed(shapes.skipped, 4)))
     findings += [PartFinding("note", text) for text in untold_tolerances(part)]
+    findings += _hidden_findings(part)
     return PartCheck(
         part=part,
         camera=camera,
@@ -413,6 +415,21 @@ def _role_findings(part: Part) -> list[PartFinding]:
             findings.append(PartFinding("warning", text))
     if not part.inspected:
         findings.append(PartFinding("warning", "no component has the role inspect: nothing is measured"))
+    return findings
+
+
+def _hidden_findings(part: Part) -> list[PartFinding]:
+    """Components that are there twice, or inside others, whose presence no picture shows."""
+    twice, inside, unsearched = hidden_components(part.model.components)
+    hint = 'leave out of the CAD, or give the role "ignore"'
+    findings = []
+    for names, text in ((twice, "there twice, at the place of an equal one"), (inside, "wholly inside another")):
+        if names:
+            told = listed(names, 6)
+            findings.append(PartFinding("warning", f"{text}, so that no view shows them; {hint}: {told}"))
+    if unsearched:
+        text = f"not searched for in others, to save time, are {len(unsearched)} components: {listed(unsearched, 4)}"
+        findings.append(PartFinding("note", text))
     return findings
 
 
