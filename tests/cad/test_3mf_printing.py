@@ -108,5 +108,11 @@ def test_supports_are_left_out_and_named(kind: str, tmp_path: Path) -> None:
 def test_a_broken_configuration_is_refused_in_one_line(tmp_path: Path) -> None:
     path = write_3mf(tmp_path / "p.3mf", f'<object id="1">{mesh_xml(*PLATE)}</object>', '<item objectid="1"/>')
     with pytest.raises(InputError, match=r"p\.3mf: broken 3MF") as caught:
-        load_cad(with_config(path, "Slic3r_PE_model.config", '<object id="1"><volume firstid="x"/></object>'))
+        load_cad(
+            with_config(
+                path,
+                "Slic3r_PE_model.config",
+                '<object id="1"><part id="1" firstid="x" subtype="negative_part"/></object>',
+            )
+        )
     assert "\n" not in str(caught.value)

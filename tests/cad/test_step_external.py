@@ -19,6 +19,11 @@ FORMS = {
         "#9{n}=DOCUMENT_FILE('17','','',#1,'',$);\n#9{n}1=APPLIED_DOCUMENT_REFERENCE(#9{n},'',(#{definition}));\n"
         "#9{n}2=APPLIED_EXTERNAL_IDENTIFICATION_ASSIGNMENT('{file}',#1,#9000,(#9{n}));"
     ),
+    # All documents have one source.
+    "common source": (
+        "#9{n}=DOCUMENT_FILE('{file}','',$,#1,'',$);\n#9{n}1=APPLIED_DOCUMENT_REFERENCE(#9{n},'',(#{definition}));\n"
+        "#9{n}2=APPLIED_EXTERNAL_IDENTIFICATION_ASSIGNMENT('7',#1,#9001,(#9{n}));"
+    ),
     "source": (
         "#9{n}=DOCUMENT_FILE('17','','',#1,'',$);\n#9{n}1=APPLIED_DOCUMENT_REFERENCE(#9{n},'',(#{definition}));\n"
         "#9{n}2=APPLIED_EXTERNAL_IDENTIFICATION_ASSIGNMENT('17',#1,#9{n}3,(#9{n}));\n"
@@ -31,7 +36,7 @@ PLATE, PIN = StepPart("plate", (50.0, 40.0, 5.0)), StepPart("pin", (10.0, 10.0, 
 def write_assembly(path: Path, parts: list[tuple[str, StepPart, np.ndarray]], form: str, files: dict[str, str]) -> Path:
     """An assembly in which some parts have no shape but a file."""
     text = StepWriter().write(path, StepAssembly(path.stem, parts)).read_text()  # type: ignore[arg-type]
-    added = ["#9000=EXTERNAL_SOURCE(IDENTIFIER(''));"]
+    added = ["#9000=EXTERNAL_SOURCE(IDENTIFIER(''));", "#9001=EXTERNAL_SOURCE('cad');"]
     for number, (name, file) in enumerate(files.items(), start=100):
         solid = re.search(rf"#(\d+)=MANIFOLD_SOLID_BREP\('{name}'", text)
         assert solid is not None

@@ -421,16 +421,13 @@ def _role_findings(part: Part) -> list[PartFinding]:
 def _hidden_findings(part: Part) -> list[PartFinding]:
     """Components that are there twice, or inside others, whose presence no picture shows."""
     twice, inside, unsearched = hidden_components(part.model.components)
-    hint = 'leave out of the CAD, or give the role "ignore"'
-    findings = []
-    for names, text in ((twice, "there twice, at the place of an equal one"), (inside, "wholly inside another")):
-        if names:
-            told = listed(names, 6)
-            findings.append(PartFinding("warning", f"{text}, so that no view shows them; {hint}: {told}"))
-    if unsearched:
-        text = f"not searched for in others, to save time, are {len(unsearched)} components: {listed(unsearched, 4)}"
-        findings.append(PartFinding("note", text))
-    return findings
+    hint = 'so that no view shows them; leave out of the CAD, or give the role "ignore"'
+    told: tuple[tuple[list[str], Severity, str], ...] = (
+        (twice, "warning", f"there twice, at the place of an equal one, {hint}"),
+        (inside, "warning", f"wholly inside another, {hint}"),
+        (unsearched, "note", "to save time, it was not searched whether these are inside others"),
+    )
+    return [PartFinding(severity, f"{text}: {listed(names, 6)}") for names, severity, text in told if names]
 
 
 def _covers(wide: Symmetry, narrow: Symmetry) -> bool:

@@ -45,8 +45,8 @@ class PictureSource(FrameSource):
 
     Where the names differ in one number only, that number is the index of the frame, so that gaps stay gaps in index
     and time; else the index is the position. Each page of a TIFF is a picture. Times are those of ``fps`` frames per
-    second from the first picture on. Pictures that cannot be read or differ in size from the first are skipped and counted. Pictures of 16 bits are
-    reduced to 8 by the bits that are used: 12-bit values in 16 bits are not left dark.
+    second from the first picture on. Pictures that cannot be read or differ in size from the first are skipped and
+    counted. Pictures of 16 bits are reduced to 8 by the bits that are used: 12-bit values in 16 bits are not left dark.
 
     Attributes:
         first_path: the first picture that can be read.

@@ -17,27 +17,24 @@ def tiff_pages(path: Path) -> list[int]:
     Source: TIFF 6.0, section 2, and BigTIFF, whose fields are wider.
     """
     pages, seen = list[int](), set[int]()
+    if path.suffix.lower() not in SUFFIXES:
+        return [0]
     try:
-        if path.suffix.lower() not in SUFFIXES:
-            return [0]
         with path.open("rb") as file:
             head = file.read(16)
-            order = ">" if head.startswith(b"MM") else "<"
-            is_big = head[2:4] in (b"\0+", b"+\0")
-            (offset,) = struct.unpack_from(order + ("Q" if is_big else "I"), head, 8 if is_big else 4)
-            count_code, entry_size, value, next_code = ("Q", 20, 12, "Q") if is_big else ("H", 12, 8, "I")
+            order, is_big = ">" if head.startswith(b"MM") else "<", b"+" in head[2:4]
+            # The code of an offset, where the first is, that of the number of tags, their size, where their value is.
+            code, at, count_code, size, value = ("Q", 8, "Q", 20, 12) if is_big else ("I", 4, "H", 12, 8)
+            (offset,) = struct.unpack_from(order + code, head, at)
             while offset and offset not in seen and len(seen) < MAX_PAGES:
                 file.seek(offset)
                 (count,) = struct.unpack(order + count_code, file.read(struct.calcsize(count_code)))
-                entries = file.read(min(count, 0xFFFF) * entry_size)
-                starts = range(0, len(entries), entry_size)
-                # A tag is followed by its type, the number of values, and the value.
-                tags = {entries[k : k + 2]: entries[k + value : k + value + 4] for k in starts}
+                data = file.read(min(count, 0xFFFF) * size)
+                tags = {data[k : k + 2]: data[k + value : k + value + 4] for k in range(0, len(data), size)}
                 (kind,) = struct.unpack(order + "I", tags.get(struct.pack(order + "H", _SUBFILE_TYPE), bytes(4)))
-                if not kind & _REDUCED_OR_MASK:
-                    pages.append(len(seen))
+                pages += [] if kind & _REDUCED_OR_MASK else [len(seen)]
                 seen.add(offset)
-                (offset,) = struct.unpack(order + next_code, file.read(struct.calcsize(next_code)))
+                (offset,) = struct.unpack(order + code, file.read(struct.calcsize(code)))
     except (OSError, struct.error, OverflowError):
         pass  # what is there is read; a page that is cut short cannot be decoded, which is told
     return pages or [0]

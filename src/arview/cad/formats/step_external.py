@@ -11,7 +11,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path, PureWindowsPath
 
-from arview.cad.formats.raw import short_list
 from arview.cad.formats.step_statements import (
     DEFINITION,
     PLACEMENT,
@@ -35,6 +34,11 @@ _DOCUMENT = re.compile(
     rb"EXTERNAL_SOURCE)\b((?:[^;']++|'[^']*+')*+);"
 )
 """Statements that lead from a product to the name of its file."""
+_REPLACED = (
+    rb"#(?:%(definition)s|%(shape)s)\s*=(?:[^;']++|'[^']*+')*+;|"
+    rb"#\d+\s*=\s*SHAPE_DEFINITION_REPRESENTATION\s*\(\s*#\d+\s*,\s*#%(shape)s\s*\)\s*;"
+)
+"""A product's definition, its shape, and that the one has the other."""
 _FILE_NAME = re.compile(rb"'([^'\n]*[^'\s]\.[A-Za-z][A-Za-z0-9]{1,7})'")
 _DATA = re.compile(rb"\bDATA\s*(?:\([^;]*\))?;(.*)\bENDSEC\s*;", re.DOTALL)
 _TOKEN = re.compile(rb"'[^']*'|/\*(?:.*?\*/|.*\Z)|#(\d+)", re.DOTALL)
@@ -75,42 +79,28 @@ class OtherFiles:
         """
         waiting = products_without_shape(data)
         files = _files_of(data, waiting) if waiting else {}
+        if not files:
+            return data
         above = (*above, path.resolve())
-        products = Products(data) if files else None
+        products, texts, offset = Products(data), list[bytes](), _largest(data)
         edits: dict[tuple[int, int], bytes] = {}
-        texts: list[bytes] = []
-        size = len(data)
-        offset = max((int(n) for n in re.findall(rb"#(\d+)\s*=", data)), default=0) if files else 0
         for definition, name in files.items():
-            assert products is not None
-            file = _beside(path, name)
+            file, shape = _beside(path, name), waiting[definition]
             if file in above or len(above) > _MAX_DEPTH:
                 raise InputError(f"{path}: broken STEP (it refers to {name}, which refers to it); export it again")
-            root = None
-            if file is not None:
-                other = self.added(self.read(file), file, above)
-                root = _root(other)
-            shape = waiting[definition]
+            other = self.added(self.read(file), file, above) if file else b""
+            root = _root(other)
             if root is None or list(waiting.values()).count(shape) > 1:
                 self.missing[plain_name(products.name_of(definition)).decode("utf-8", errors="replace")] = name
                 continue
-            size += len(other)
-            if size > MAX_BYTES:
-                raise InputError(f"{path}: more than {MAX_BYTES / 1e6:.0f} MB with its other files; export fewer parts")
             texts.append(_renumbered(other, offset, dict(zip(root, (definition, shape), strict=True))))
-            offset += max(int(n) for n in re.findall(rb"#(\d+)\s*=", other))
-            edits |= _statements_of(data, definition, shape)
+            if len(data) + sum(map(len, texts)) > MAX_BYTES:
+                raise InputError(f"{path}: more than {MAX_BYTES / 1e6:.0f} MB with its other files; export fewer parts")
+            offset += _largest(other)
+            replaced = re.finditer(_REPLACED % {b"definition": definition, b"shape": shape}, data)
+            edits |= {match.span(): b"" for match in replaced}
         at = data.rfind(b"ENDSEC")
-        return edited(data, {**edits, (at, at): b"\n".join(texts) + b"\n"}) if texts else data
-
-    def note(self) -> list[str]:
-        """What to say of the files that are missing."""
-        if not self.missing:
-            return []
-        told = short_list([f"{file} ({name})" for name, file in self.missing.items()])
-        return [
-            f"left out, because their STEP files are not beside it, or hold no single product; put them there: {told}"
-        ]
+        return edited(data, {**edits, (at, at): b"\n".join([*texts, b""])})
 
 
 def _files_of(data: bytes, definitions: dict[bytes, bytes]) -> dict[bytes, str]:
@@ -118,24 +108,19 @@ def _files_of(data: bytes, definitions: dict[bytes, bytes]) -> dict[bytes, str]:
     held = {m[1]: m[2] for m in _DOCUMENT.finditer(data)}
     formations = {m[1]: m[3] for m in DEFINITION.finditer(data)}
     links: dict[bytes, list[bytes]] = {}
-    for one, text in held.items():
-        for other in references(text):
-            links.setdefault(one, []).append(other)
-            # A source may be common to all documents.
-            if b"EXTERNAL_SOURCE" not in text:
-                links.setdefault(other, []).append(one)
+    for one, other in ((one, other) for one, text in held.items() for other in references(text)):
+        links.setdefault(one, []).append(other)
+        links.setdefault(other, []).append(one)
+    # Neither another part nor a source, which may be common to all documents, leads on.
     parts = {m[6] for m in USE.finditer(data)}
     files: dict[bytes, str] = {}
     for definition in definitions:
-        seen = {definition: b""}
-        waiting = [definition]
-        for one in waiting:
-            for other in links.get(one, ()):
-                if other in seen or other in parts or other not in held or other == formations.get(definition):
-                    continue
-                seen[other] = held[other]
-                waiting.append(other)
-        names = [name.decode("utf-8", errors="replace") for text in seen.values() for name in _FILE_NAME.findall(text)]
+        found = [definition]
+        for one in found:
+            known = {*found, *parts, formations.get(definition)}
+            is_end = one in held and not references(held[one])
+            found += [] if is_end else [k for k in dict.fromkeys(links.get(one, ())) if k in held and k not in known]
+        names = [name.decode("utf-8", errors="replace") for one in found[1:] for name in _FILE_NAME.findall(held[one])]
         if names:
             files[definition] = next((name for name in names if name.lower().endswith(SUFFIXES)), names[0])
     return files
@@ -170,17 +155,11 @@ def _renumbered(data: bytes, offset: int, own: dict[bytes, bytes]) -> bytes:
     """The statements of a file with other numbers: some of their own, the others raised."""
 
     def new(match: re.Match[bytes]) -> bytes:
-        number = match[1]
-        return match[0] if number is None else b"#" + (own.get(number) or b"%d" % (int(number) + offset))
+        return b"#" + (own.get(match[1]) or b"%d" % (int(match[1]) + offset)) if match[1] else match[0]
 
-    found = _DATA.search(data)
-    return _TOKEN.sub(new, found[1]) if found else b""
+    return _TOKEN.sub(new, b"".join(_DATA.findall(data)))
 
 
-def _statements_of(data: bytes, definition: bytes, shape: bytes) -> dict[tuple[int, int], bytes]:
-    """Edits that remove the statements of a product's definition, of its shape, and that the one has the other."""
-    spans = [m.span() for m in SHAPE_OF.finditer(data) if m[2] == shape]
-    for one in (definition, shape):
-        found = re.search(rb"(?<!\d)#%s\s*=((?:[^;']++|'[^']*+')*+)(?=;)" % one, data)
-        spans += [found.span()] if found else []
-    return dict.fromkeys(spans, b"")
+def _largest(data: bytes) -> int:
+    """The largest number of a statement."""
+    return max((int(number) for number in re.findall(rb"#(\d+)\s*=", data)), default=0)

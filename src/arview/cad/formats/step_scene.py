@@ -56,23 +56,18 @@ def hide_bodies(data: bytes) -> tuple[bytes, list[str]]:
         return data, []
     shown = {m[1]: (m[2], references(m[3])) for m in _SHOWN.finditer(data)}
     placed = {m[1]: m[2] for m in _PLACED.finditer(data)}
-    hidden, waiting = set[bytes](), [one for kind, held in shown.values() if kind == b"INVISIBILITY" for one in held]
-    seen, deep = set[bytes](), 0
+    waiting, deep = [one for kind, held in shown.values() if kind == b"INVISIBILITY" for one in held], 0
+    hidden = set[bytes]()
     while waiting:
         one = waiting.pop()
-        kind, held = shown.get(one, (b"", []))
-        if one in seen:
-            continue
-        seen.add(one)
+        kind, held = (b"", []) if one in hidden else shown.get(one, (b"", []))
         hidden.add(one)
         if kind.endswith(b"STYLED_ITEM"):
             places = [other for other in held if other in placed]
-            # An overriding style refers to the one that it overrides, which holds elsewhere.
             deep += len(places) > 1
-            if not places:
-                hidden.update(other for other in held if b"STYLED_ITEM" not in shown.get(other, (b"",))[0])
-            elif len(places) == 1:
-                hidden.update(places)
+            # An overriding style refers to the one that it overrides, which holds elsewhere.
+            items = [other for other in held if b"STYLED_ITEM" not in shown.get(other, (b"",))[0]]
+            hidden.update(places if len(places) == 1 else items if not places else ())
         elif kind:
             waiting += held
     products, edits, names = Products(data), dict[tuple[int, int], bytes](), list[bytes]()
@@ -84,11 +79,10 @@ def hide_bodies(data: bytes) -> tuple[bytes, list[str]]:
             edits[match.span(3)] = b",".join(b"#" + i for i in items if i not in left_out)
             owner = products.of_shape(match[1])
             names += [plain_name(bodies[i]) or plain_name(owner[-1] if owner else b"'unnamed'") for i in left_out]
-    uses = {m[1]: m for m in USE.finditer(data)}
-    for one in (one for one in placed if one in hidden):
-        if use := uses.get(products.definition.get(placed[one], b"")):
-            names.append(plain_name(use[3]) or plain_name(products.name_of(use[6])))
-            edits[use.start(3), use.end(4)] = b"'%s',''" % HIDDEN.encode()
+    uses = {products.definition.get(shape) for one, shape in placed.items() if one in hidden}
+    for use in (m for m in USE.finditer(data) if m[1] in uses):
+        names.append(plain_name(use[3]) or plain_name(products.name_of(use[6])))
+        edits[use.start(3), use.end(4)] = b"'%s',''" % HIDDEN.encode()
     told = short_list([name.decode("utf-8", errors="replace") for name in dict.fromkeys(names)])
     notes = [f"left out, because the STEP file hides them (show and export them to have them): {told}"] if names else []
     if deep:

@@ -39,7 +39,11 @@ def prepare_step(data: bytes, path: Path) -> tuple[bytes, list[str]]:
     others = OtherFiles(lambda file: _checked_text(file.read_bytes(), file))
     data = others.added(_checked_text(data, path), path)
     _check_instances(data, path)
-    notes, products = others.note(), Products(data)
+    notes, products = list[str](), Products(data)
+    if others.missing:
+        told = short_list([f"{file} ({name})" for name, file in others.missing.items()])
+        why = "their STEP files are not beside it, or do not hold one product"
+        notes.append(f"left out, because {why}; put them there: {told}")
     missing = [
         plain_name(products.name_of(one)).decode("utf-8", errors="replace") for one in products_without_shape(data)
     ]
@@ -156,8 +160,7 @@ def split_solids(data: bytes) -> bytes:
                 context=match[4],
                 kind=b"TESSELLATED" if item in meshes else b"ADVANCED_BREP",
                 parent=(definition, shape),
-                definition_context=definition_context,
-                product_context=product_context,
+                contexts=(definition_context, product_context),
             )
             added += _statements(new_id, parts)
             new_id += len(parts)
@@ -174,11 +177,10 @@ def _product_of_solid(
     context: bytes,
     kind: bytes,
     parent: tuple[bytes, bytes],
-    definition_context: bytes,
-    product_context: bytes,
+    contexts: tuple[bytes, bytes],
 ) -> list[bytes]:
     """Statements, numbered from ``first``, of a product of one solid and of its use in a parent (definition, shape)."""
-    n = first
+    n, (definition_context, product_context) = first, contexts
     return [
         b"%s_SHAPE_REPRESENTATION(%s,(%s,%s),#%s)" % (kind, name, origin, solid, context),
         b"PRODUCT(%s,%s,'',(#%s))" % (name, name, product_context),

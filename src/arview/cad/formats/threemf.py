@@ -2,8 +2,9 @@
 
 Source: 3MF Core Specification 1.3, Materials extension (basematerials, colorgroup), Production extension
 (``p:path``). What is there only for printing, as supports and the modifiers of slicers, is left out and told.
-Written because general loaders drop the names of instances. The XML is read as a stream, so that memory grows with
-the triangles alone.
+PrusaSlicer keeps all volumes of an object in one mesh, and what they are in ``Metadata/Slic3r_PE_model.config``; Bambu
+Studio and OrcaSlicer tell it of components in ``Metadata/model_settings.config``. Written because general loaders drop
+the names of instances. The XML is read as a stream, so that memory grows with the triangles alone.
 """
 
 from __future__ import annotations
@@ -27,12 +28,13 @@ from arview.cad.formats.raw import (
     short_list,
     unit_in_mm,
 )
-from arview.cad.formats.slicer_config import FILES, SlicerConfig
 from arview.errors import InputError
 from arview.geometry import Array
 
 _BODIES = ("model", "surface")
 """Types of objects that are bodies; the others are support, solidsupport and other."""
+_CONFIGS = ("metadata/slic3r_pe_model.config", "metadata/slic3r_model.config", "metadata/model_settings.config")
+_CUTTERS = ("negativevolume", "negativepart")
 _MAX_DEPTH = 100
 _MAX_BYTES = 2_000_000_000
 _MAX_RATIO, _RATIO_FROM_BYTES = 100, 20_000_000
@@ -82,7 +84,7 @@ class _Archive:
         self.objects: dict[Key, _Object] = {}
         self.counts: dict[Key, int] = {}
         self.model = RawModel()
-        self.config = SlicerConfig()
+        self.volumes: dict[str, list[Attributes]] = {}
         self.left_out: dict[str, None] = {}
         self.uncut: dict[str, None] = {}
 
@@ -104,8 +106,8 @@ class _Archive:
             if name.lower().endswith(".model") and name != main:
                 self._read_part(name)
         for name in names:
-            if name.lower() in FILES:
-                self._parse(name, self.config.start, self.config.end)
+            if name.lower() in _CONFIGS:
+                self._read_config(name)
         part = self._read_part(main)
         self.model.unit_mm = unit_in_mm(part.unit)
         if self.model.unit_mm is None:
@@ -147,6 +149,21 @@ class _Archive:
         self._parse(name, part.start, part.end)
         return part
 
+    def _read_config(self, name: str) -> None:
+        """Keep what a slicer says of each object and then of its volumes: attributes and metadata."""
+        held: list[Attributes] = []
+
+        def start(tag: str, attributes: Attributes) -> None:
+            nonlocal held
+            if tag == "object":
+                held = self.volumes[attributes["id"]] = []
+            if tag in ("object", "volume", "part"):
+                held.append(attributes)
+            elif tag == "metadata" and held and "key" in attributes:
+                held[-1].setdefault(attributes["key"], attributes.get("value", ""))
+
+        self._parse(name, start, lambda tag: None)
+
     def _parse(self, name: str, start: Callable[[str, Attributes], None], end: Callable[[str], None]) -> None:
         """Report the elements of an archive member by their names without namespaces."""
         parser = expat.ParserCreate(namespace_separator="}")
@@ -172,27 +189,24 @@ class _Archive:
 
     def _instantiate(self, key: Key, root_from_object: Array, path: tuple[str, ...], name: str | None) -> None:
         this = self.objects[key]
-        own_name = name or this.name or self.config.names.get(key[1], "")
+        settings, *volumes = self.volumes.get(key[1], [{}])
+        own_name = name or this.name or settings.get("name", "")
         if this.kind not in _BODIES:
             self.left_out[f"{own_name or key[1]} ({this.kind})"] = None
             return
         here = (*path, own_name)
-        volumes = self.config.volumes.get(key[1], [])
-        others = [volume for volume in volumes if not volume.is_body]
-        for volume in others:
-            told = self.uncut if volume.is_cutter else self.left_out
-            told[f"{volume.name or 'unnamed'} ({volume.kind})"] = None
-        faces = this.mesh.faces
-        for volume in sorted(others, key=lambda one: -one.first):
-            faces = np.delete(faces, slice(max(volume.first, 0), max(volume.last + 1, 0)), axis=0)
-        if len(faces):
-            mesh = replace(this.mesh, path=tuple(n for n in here if n), faces=faces)
+        is_body, others = np.ones(len(this.mesh.faces), dtype=bool), set[str]()
+        for volume, kind in ((volume, _kind_of(volume)) for volume in volumes if _kind_of(volume)):
+            (self.uncut if kind in _CUTTERS else self.left_out)[f"{volume.get('name') or 'unnamed'} ({kind})"] = None
+            others.add(volume.get("id", ""))
+            is_body[max(int(volume.get("firstid", 0)), 0) : max(int(volume.get("lastid", -1)) + 1, 0)] = False
+        if is_body.any():
+            mesh = replace(this.mesh, path=tuple(n for n in here if n), faces=this.mesh.faces[is_body])
             self.model.add(mesh, self.path, root_from_object)
-        parts = {volume.component: volume for volume in volumes if volume.component}
+        names = {volume.get("id"): volume.get("name") for volume in volumes}
         for child, object_from_child in this.children:
-            part = parts.get(child[1])
-            if part is None or part.is_body:
-                self._instantiate(child, root_from_object @ object_from_child, here, part.name if part else None)
+            if child[1] not in others:
+                self._instantiate(child, root_from_object @ object_from_child, here, names.get(child[1]))
 
 
 class _ModelPart:
@@ -266,6 +280,13 @@ class _ModelPart:
             if key.endswith("}path"):
                 part = posixpath.normpath(value).lstrip("/")
         return part, attributes["objectid"]
+
+
+def _kind_of(volume: Attributes) -> str:
+    """What a volume is for a slicer; empty for a body."""
+    kind = volume.get("volume_type") or volume.get("subtype") or ("modifier" if volume.get("modifier") == "1" else "")
+    plain = kind.replace("_", "").strip().lower()
+    return "" if plain in ("modelpart", "normalpart") else plain
 
 
 def _transform(attributes: Attributes) -> Array:

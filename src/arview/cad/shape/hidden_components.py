@@ -31,25 +31,20 @@ def hidden_components(components: Sequence[Component]) -> tuple[list[str], list[
     outer: dict[int, Array] = {}
     for k, component in enumerate(components):
         is_around = ((low <= low[k] + margins[k]) & (high >= high[k] - margins[k])).all(axis=1)
-        for other in (int(n) for n in np.flatnonzero(is_around) if n != k):
-            name = f"{component.name} (in {components[other].name})"
-            if np.abs([low[other] - low[k], high[other] - high[k]]).max() <= margins[k]:
-                if other < k and _is_equal(component, components[other], margins[k]):
-                    twice.append(name)
-                    break
-                continue
+        is_same = np.maximum(np.abs(low - low[k]), np.abs(high - high[k])).max(axis=1) <= margins[k]
+        same = [n for n in np.flatnonzero(is_same[:k]).tolist() if _is_equal(component, components[n], margins[k])]
+        twice += [f"{component.name} (in {components[n].name})" for n in same[:1]]
+        for n in () if same else np.flatnonzero(is_around & ~is_same).tolist():
             if work > MAX_WORK:
                 unsearched.append(component.name)
                 break
-            if other not in outer:
-                outer[other] = _outer_corners(components[other])
+            corners = outer[n] = outer[n] if n in outer else _outer_corners(components[n])
+            points = _points(component)
             # Most are outside already by their first point.
-            for point in _points(component):
-                work += len(outer[other])
-                if _winding(point, outer[other]) < MIN_WINDING:
-                    break
-            else:
-                inside.append(name)
+            count = next((i for i, point in enumerate(points) if _winding(point, corners) < MIN_WINDING), len(points))
+            work += (count + 1) * len(corners)
+            if count == len(points):
+                inside.append(f"{component.name} (in {components[n].name})")
                 break
     return twice, inside, unsearched
 
