@@ -20,6 +20,7 @@ StepLimits = ProcessLimits
 DEFAULT = StepLimits()
 _PLACEHOLDER_NAME = re.compile(r"Open ?CASCADE STEP translator [\d. ]+|NONE|=>\[[\d:]+\]", re.IGNORECASE)
 """Names that writers give to products that have none."""
+_ANALYSIS = re.compile(rb"FILE_SCHEMA\s*\(\s*\(\s*'(?:AP209|STRUCTURAL_ANALYSIS_DESIGN)", re.IGNORECASE)
 _USUAL_TOL_MM, _USUAL_TOL_DEG = 0.01, 1.0
 """Tolerances below these are named in a message when the triangulation fails."""
 _OUT_OF_MEMORY = ("bad_alloc", "MemoryError", "failed to map", "Cannot allocate memory")
@@ -61,6 +62,8 @@ def read_step(
         named = tuple(name for name in mesh.path if not _PLACEHOLDER_NAME.fullmatch(name.strip()))
         raw.components[index] = replace(mesh, path=named, vertices=mesh.vertices * factor)
     raw.notes += notes
+    if not raw.triangle_count and _ANALYSIS.search(data[:8192]):
+        raw.notes.append("AP209, a model for finite elements, holds no shape; export AP214 or AP242")
     return raw
 
 
@@ -91,5 +94,7 @@ def _triangulated(data: bytes, path: Path, tol_linear_mm: float, tol_angular_deg
         if not reason and any(word in printed for word in _OUT_OF_MEMORY):
             reason = f"it needs more than {limits.memory_of(size_mb) / 1000:.1f} GB of memory"
         reason = reason or (f"OpenCASCADE crashed, code {code}" if code else "no shape in it")
+        if _ANALYSIS.search(data[:8192]):
+            raise InputError(f"{path}: AP209, a model for finite elements, holds no shape; export AP214 or AP242")
         raise InputError(f"{path}: broken or truncated STEP ({reason}); export it again")
     return glb

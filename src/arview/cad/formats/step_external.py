@@ -31,16 +31,16 @@ _MAX_DEPTH = 30
 _DOCUMENT = re.compile(
     rb"#(\d+)\s*=\s*\(?\s*(?:PRODUCT_DEFINITION_WITH_ASSOCIATED_DOCUMENTS|PRODUCT_DEFINITION_FORMATION\w*|DOCUMENT_FILE|"
     rb"DOCUMENT|DOCUMENT_PRODUCT_EQUIVALENCE|APPLIED_DOCUMENT_REFERENCE|APPLIED_EXTERNAL_IDENTIFICATION_ASSIGNMENT|"
-    rb"EXTERNAL_SOURCE)\b((?:[^;']++|'[^']*+')*+);"
+    rb"EXTERNAL_SOURCE)\b((?:[^;'=]++|'[^']*+')*+);"
 )
 """Statements that lead from a product to the name of its file."""
 _REPLACED = (
-    rb"#(?:%(definition)s|%(shape)s)\s*=(?:[^;']++|'[^']*+')*+;|"
+    rb"#(?:%(definition)s|%(shape)s)\s*=(?:[^;'=]++|'[^']*+')*+;|"
     rb"#\d+\s*=\s*SHAPE_DEFINITION_REPRESENTATION\s*\(\s*#\d+\s*,\s*#%(shape)s\s*\)\s*;"
 )
 """A product's definition, its shape, and that the one has the other."""
 _FILE_NAME = re.compile(rb"'([^'\n]*[^'\s]\.[A-Za-z][A-Za-z0-9]{1,7})'")
-_DATA = re.compile(rb"\bDATA\s*(?:\([^;]*\))?;(.*)\bENDSEC\s*;", re.DOTALL)
+_DATA = re.compile(rb"\bDATA\s*[;(]")
 _TOKEN = re.compile(rb"'[^']*'|/\*(?:.*?\*/|.*\Z)|#(\d+)", re.DOTALL)
 
 
@@ -157,7 +157,8 @@ def _renumbered(data: bytes, offset: int, own: dict[bytes, bytes]) -> bytes:
     def new(match: re.Match[bytes]) -> bytes:
         return b"#" + (own.get(match[1]) or b"%d" % (int(match[1]) + offset)) if match[1] else match[0]
 
-    return _TOKEN.sub(new, b"".join(_DATA.findall(data)))
+    start = _DATA.search(data)
+    return _TOKEN.sub(new, data[data.find(b";", start.start()) + 1 : data.rfind(b"ENDSEC")] if start else b"")
 
 
 def _largest(data: bytes) -> int:

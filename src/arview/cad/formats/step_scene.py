@@ -18,12 +18,13 @@ from arview.cad.formats.step_statements import (
 HIDDEN = "hidden place of an assembly"
 """Name of a place that is to be left out with all that is there: without its statement, its product would be a root."""
 _NO_NAME = re.compile(
-    rb"\$|'\s*(?:NAUO[\s_-]*\d+|NONE|=>\[[\d:]+\]|next.assembly.(?:relationship|usage.occurrence))?\s*'", re.IGNORECASE
+    rb"\$|'\s*+(?:NAUO[\s_-]*\d+|NONE|=>\[[\d:]+\]|next.assembly.(?:relationship|usage.occurrence))?\s*+'",
+    re.IGNORECASE,
 )
 """Names of places that writers put where there is none: blanks, numbers of statements, and fixed words."""
 _SHOWN = re.compile(
     rb"#(\d+)\s*=\s*\(?\s*(INVISIBILITY|[A-Z_]*STYLED_ITEM|PRESENTATION_LAYER_ASSIGNMENT|"
-    rb"(?:[A-Z_]+_)?REPRESENTATION)\b((?:[^;']++|'[^']*+')*+);"
+    rb"(?:[A-Z_]+_)?REPRESENTATION)\b((?:[^;'=]++|'[^']*+')*+);"
 )
 """Statements that hide, and those that tell which bodies they mean."""
 _BODY = re.compile(
