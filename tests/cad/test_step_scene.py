@@ -110,12 +110,12 @@ def test_a_file_whose_bodies_are_all_hidden_is_refused(tmp_path: Path) -> None:
         load_cad(path)
 
 
-def tessellated(writer: StepWriter, name: str, low_mm: float, kind: str) -> int:
+def tessellated(writer: StepWriter, name: str, low_mm: float, kind: str, link: str = "$") -> int:
     """A tetrahedron with legs of 30 mm."""
     x, far = low_mm, low_mm + 30.0
     points = writer.add(f"COORDINATES_LIST('',4,(({x},0.,0.),({far},0.,0.),({x},30.,0.),({x},0.,30.)))")
     face = writer.add(f"TRIANGULATED_FACE('',#{points},4,(),$,(),((1,3,2),(1,2,4),(2,3,4),(1,4,3)))")
-    return writer.add(f"{kind}('{name}',(#{face}),$)")
+    return writer.add(f"{kind}('{name}',(#{face}),{link})")
 
 
 @pytest.mark.parametrize("kind", ["TESSELLATED_SOLID", "TESSELLATED_SHELL"])
@@ -133,3 +133,19 @@ def test_named_tessellated_solids_are_components(kind: str, tmp_path: Path) -> N
         "left": [[0.0, 0.0, 0.0], [30.0, 30.0, 30.0]],
         "right": [[50.0, 0.0, 0.0], [80.0, 30.0, 30.0]],
     }
+
+
+def test_a_tessellated_body_that_repeats_an_exact_one_is_no_second(tmp_path: Path) -> None:
+    writer = StepWriter()
+    writer.item(PIN)
+    body = "\n".join(writer.lines)
+    solid, shape = (
+        re.search(rf"#(\d+)={kind}\(", body) for kind in ("MANIFOLD_SOLID_BREP", "PRODUCT_DEFINITION_SHAPE")
+    )
+    assert solid is not None and shape is not None
+    frame = writer.axis(np.zeros(3), np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0]))
+    mesh = tessellated(writer, "pin", 0.0, "TESSELLATED_SOLID", f"#{solid[1]}")
+    items = writer.refs([frame, mesh])
+    other = writer.add(f"TESSELLATED_SHAPE_REPRESENTATION('',{items},#{writer.context})")
+    writer.add(f"SHAPE_DEFINITION_REPRESENTATION(#{shape[1]},#{other})")
+    assert bounds_of(writer.write(tmp_path / "a.step", PIN)) == {"pin": [[0.0, 0.0, 0.0], [10.0, 10.0, 30.0]]}

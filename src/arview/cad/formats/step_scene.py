@@ -6,7 +6,9 @@ import re
 
 from arview.cad.formats.raw import short_list
 from arview.cad.formats.step_statements import (
+    REF,
     SHAPE,
+    SOLID,
     TEXT,
     USE,
     Products,
@@ -32,6 +34,9 @@ _BODY = re.compile(
     rb"(?:SHELL|FACE)_BASED_SURFACE_MODEL|(?:COMPLEX_)?TRIANGULATED_SURFACE_SET)\s*\(" + TEXT
 )
 """What is a component when it is shown; hidden sketches and frames are none."""
+_REPEATED = re.compile(
+    rb"#(\d+)\s*=\s*TESSELLATED_(?:SOLID|SHELL)\s*\(" + TEXT + rb",\s*\([#\d,\s]*\)\s*," + REF + rb"\)"
+)
 _PLACED = re.compile(rb"#(\d+)\s*=\s*CONTEXT_DEPENDENT_SHAPE_REPRESENTATION\s*\(\s*#\d+\s*,\s*#(\d+)\s*\)\s*;")
 
 
@@ -46,6 +51,17 @@ def name_uses(data: bytes) -> bytes:
         return data
     products = Products(data)
     return edited(data, {(m.start(3), m.end(4)): b"%s,''" % products.name_of(m[6]) for m in uses})
+
+
+def drop_repeated(data: bytes) -> bytes:
+    """The file without tessellated bodies that repeat an exact one, to which they refer."""
+    exact = {m[1] for m in SOLID.finditer(data) if not m[2]}
+    repeated = {m[1] for m in _REPEATED.finditer(data) if m[3] in exact}
+    if not repeated:
+        return data
+    shapes = {m.span(3): re.findall(rb"\d+", m[3]) for m in SHAPE.finditer(data)}
+    kept = {span: [b"#" + item for item in items if item not in repeated] for span, items in shapes.items()}
+    return edited(data, {span: b",".join(items) for span, items in kept.items()})
 
 
 def hide_bodies(data: bytes) -> tuple[bytes, list[str]]:

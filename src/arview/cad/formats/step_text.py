@@ -13,7 +13,7 @@ import numpy as np
 
 from arview.cad.formats.raw import check_instance_count, short_list, unit_in_mm
 from arview.cad.formats.step_external import OtherFiles, products_without_shape
-from arview.cad.formats.step_scene import hide_bodies, name_uses
+from arview.cad.formats.step_scene import drop_repeated, hide_bodies, name_uses
 from arview.cad.formats.step_statements import (
     SHAPE,
     SOLID,
@@ -52,7 +52,7 @@ def prepare_step(data: bytes, path: Path) -> tuple[bytes, list[str]]:
             f"{len(missing)} products of the STEP file have no shape in it and are left out; is it in other files? "
             f"Export one file with all: {short_list(missing)}"
         )
-    data, hidden = hide_bodies(data)
+    data, hidden = hide_bodies(drop_repeated(data))
     return split_solids(name_uses(data)), notes + hidden
 
 
