@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 import tracemalloc
 import zipfile
@@ -208,3 +209,38 @@ def test_hostile_3mf_is_refused_with_little_memory(make, expected: str, tmp_path
     assert time.process_time() - start < 2.0
     assert peak < 20e6
     assert "\n" not in str(caught.value) and str(path) in str(caught.value)
+
+
+def stl_text(vertices: np.ndarray, faces: np.ndarray) -> str:
+    facets = ["".join(f"  vertex {x:.6f} {y:.6f} {z:.6f}\n" for x, y, z in vertices[face]) for face in faces]
+    body = "".join(f" facet normal 0 0 0\n  outer loop\n{facet}  endloop\n endfacet\n" for facet in facets)
+    return f"solid a, v1.2\n{body}endsolid a, v1.2\n"
+
+
+def ply_text(vertices: np.ndarray, faces: np.ndarray) -> str:
+    points = "".join(f"{x:.6f} {y:.6f} {z:.6f}\n" for x, y, z in vertices)
+    properties = "".join(f"property float {axis}\n" for axis in "xyz")
+    head = f"ply\nformat ascii 1.0\nelement vertex {len(vertices)}\n{properties}element face {len(faces)}\n"
+    triangles = "".join(f"3 {a} {b} {c}\n" for a, b, c in faces)
+    return f"{head}property list uchar int vertex_indices\nend_header\n{points}{triangles}"
+
+
+@pytest.mark.parametrize("suffix", ["stl", "obj", "ply"])
+def test_decimal_commas_are_read_and_told(suffix: str, tmp_path: Path) -> None:
+    mesh = box((-1.5, 0.25, 0.0), (60.125, 40.5, 5.75))
+    text = {"stl": stl_text(*mesh), "obj": obj_text("a", *mesh), "ply": ply_text(*mesh)}[suffix]
+    path = tmp_path / f"a.{suffix}"
+    path.write_text(re.sub(r"(?<=\d)\.(?=\d+ |\d+\n)", ",", text).replace("ascii 1,0", "ascii 1.0"))
+    assert "60,125" in path.read_text()
+    cad = load_cad(path, "mm")
+    np.testing.assert_allclose(cad.model.bounds_in_model, [[-1.5, 0.25, 0.0], [60.125, 40.5, 5.75]])
+    assert cad.notes == ("its numbers have decimal commas",)
+    with pytest.raises(InputError, match=rf"which unit\? {suffix.upper()} files carry no unit; give"):
+        load_cad(path)
+
+
+def test_commas_between_thousands_are_no_decimals(tmp_path: Path) -> None:
+    path = tmp_path / "a.stl"
+    path.write_text(stl_text(*box((0.0, 0.0, 0.0), (60.0, 40.0, 5.0))).replace("vertex 60.000000", "vertex 1,060.000"))
+    with pytest.raises(InputError, match=r"a\.stl: broken STL \(no numbers: '.*vertex 1,060\.000 .*'\)"):
+        load_cad(path, "mm")

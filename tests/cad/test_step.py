@@ -122,6 +122,9 @@ HOSTILE = [
     ("/*" * 500_000, "STEP"),
     (uses([(1, 2), (2, 3), (3, 1)]), "an assembly holds itself"),
     (uses([(i, i + 1) for i in range(1, 11) for _ in range(10)]), "more than 10,000 components"),
+    ("#7=INVISIBILITY((#1));\n" + "#1=STYLED_ITEM('x')\n" * 50_000, "broken or truncated STEP|no triangles"),
+    ("#7=INVISIBILITY((#1));\n" + "#1=STYLED_ITEM(')#1=STYLED_ITEM(')\n" * 50_000, "STEP|no triangles"),
+    (f"#1=NEXT_ASSEMBLY_USAGE_OCCURRENCE('1','{' ' * 200_000}x','',#2,#3,$);", "STEP|no triangles"),
 ]
 
 
@@ -133,6 +136,14 @@ def test_hostile_text_is_refused_at_once(body: str, expected: str, tmp_path: Pat
         load_model(path)
     assert time.perf_counter() - start < 10.0
     assert "\n" not in str(caught.value) and str(path) in str(caught.value)
+
+
+def test_a_model_for_finite_elements_is_named(tmp_path: Path) -> None:
+    path = step_file(tmp_path / "a.stp", "#1=PRODUCT('a','a','',(#2));")
+    schema = "FILE_SCHEMA(('AP209_MULTIDISCIPLINARY_ANALYSIS_AND_DESIGN_MIM_LF { 1 0 10303 409 3 1 4 }'));"
+    path.write_text(path.read_text().replace("HEADER;\n", f"HEADER;\n{schema}\n"))
+    with pytest.raises(InputError, match=r"a\.stp: AP209, a model for finite elements, holds no shape; export AP214"):
+        load_model(path)
 
 
 @pytest.mark.slow

@@ -16,6 +16,7 @@ from arview.cad.fitness import MeshFitness, inspect_mesh
 from arview.cad.model import Component
 from arview.cad.part import ComponentSettings, Part
 from arview.cad.shape.equal_shapes import ShapeSymmetries
+from arview.cad.shape.hidden_components import hidden_components
 from arview.cad.shape.symmetry import FoundSymmetry, Symmetry, find_symmetries
 from arview.cad.tolerance_check import tolerance_remarks, untold_tolerances
 from arview.cad.view_range import ViewRange
@@ -209,6 +210,7 @@ def check_part(part: Part, camera: Camera | None = None) -> PartCheck:
         text = f"own symmetries were not searched, to save time, of {len(shapes.skipped)} components: "
         findings.append(PartFinding("note", text + listed(shapes.skipped, 4)))
     findings += [PartFinding("note", text) for text in untold_tolerances(part)]
+    findings += _hidden_findings(part)
     return PartCheck(
         part=part,
         camera=camera,
@@ -414,6 +416,18 @@ def _role_findings(part: Part) -> list[PartFinding]:
     if not part.inspected:
         findings.append(PartFinding("warning", "no component has the role inspect: nothing is measured"))
     return findings
+
+
+def _hidden_findings(part: Part) -> list[PartFinding]:
+    """Components that are there twice, or inside others, whose presence no picture shows."""
+    twice, inside, unsearched = hidden_components(part.model.components)
+    hint = 'so that no view shows them; leave out of the CAD, or give the role "ignore"'
+    told: tuple[tuple[list[str], Severity, str], ...] = (
+        (twice, "warning", f"there twice, at the place of an equal one, {hint}"),
+        (inside, "warning", f"wholly inside another, {hint}"),
+        (unsearched, "note", "to save time, it was not searched whether these are inside others"),
+    )
+    return [PartFinding(severity, f"{text}: {listed(names, 6)}") for names, severity, text in told if names]
 
 
 def _covers(wide: Symmetry, narrow: Symmetry) -> bool:

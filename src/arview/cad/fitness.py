@@ -186,7 +186,7 @@ def _edges(faces: Faces, vertex_count: int) -> tuple[NDArray[np.int64], NDArray[
     return counts, balance, inverse.reshape(-1, 3)
 
 
-def _bodies(faces: Faces, vertex_count: int) -> NDArray[np.int64]:
+def face_bodies(faces: Faces, vertex_count: int) -> NDArray[np.int64]:
     """(F,) number of the edge-connected body of each triangle."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
@@ -205,7 +205,7 @@ def _wind_outwards(vertices: Array, faces: Faces) -> Faces:
     counts, balance, _ = _edges(faces, len(vertices))
     if np.any(balance[counts == 2] != 0):
         faces = _wind_alike(vertices, faces)
-    bodies = _bodies(faces, len(vertices))
+    bodies = face_bodies(faces, len(vertices))
     counts, balance, edges_of_face = _edges(faces, len(vertices))
     is_open = ((counts != 2) | (balance != 0))[edges_of_face].any(axis=1)
     closed = np.bincount(bodies, weights=is_open) == 0

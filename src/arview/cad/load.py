@@ -124,7 +124,7 @@ def load_cad(
     for component in raw.components:
         _check_finite(component, path)
     if raw.triangle_count == 0:
-        raise InputError(f"{path}: holds no triangles (empty, or points and lines only)")
+        raise InputError(f"{path}: {'; '.join(raw.notes) or 'holds no triangles (empty, or points and lines only)'}")
     factor_mm = _unit_factor(raw, path, unit)
     names, notes = unique_names([component.path for component in raw.components], path.stem)
     components, paths = [], []
@@ -219,7 +219,8 @@ def _unit_factor(raw: RawModel, path: Path, unit: str | None) -> float:
         return raw.unit_mm
     size = _bounding_size(raw)
     choices = ", ".join(f"--unit {name} ({_size_text(size * mm)})" for name, mm in UNIT_MM.items())
-    reason = "; ".join(raw.notes) or f"{path.suffix[1:].upper()} files carry no unit"
+    is_without = path.suffix.lower() in (".stl", ".obj", ".ply") or not raw.notes
+    reason = f"{path.suffix[1:].upper()} files carry no unit" if is_without else "; ".join(raw.notes)
     raise InputError(f"{path}: which unit? {reason}; give {choices}")
 
 

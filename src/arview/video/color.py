@@ -49,6 +49,15 @@ def rgb_from_video_frame(frame: VideoFrame) -> Image:
     return np.ascontiguousarray(frame.to_ndarray(format="rgb24", threads=1, **options))
 
 
+def deep_gray_or_rgb(frame: VideoFrame) -> NDArray[np.uint16] | None:
+    """(H,W) or (H,W,3) values of a frame of 16 bits, grey or RGB, as they are stored; None of another frame."""
+    is_hdr = frame.color_trc in (ColorTrc.ARIB_STD_B67, ColorTrc.SMPTE2084)
+    is_gray = frame.format.name.startswith(("gray16", "ya16"))
+    if is_hdr or not (is_gray or (frame.format.is_rgb and frame.format.components[0].bits == 16)):
+        return None
+    return frame.to_ndarray(format="gray16le" if is_gray else "rgb48le", threads=1).astype(np.uint16, copy=False)
+
+
 def tone_map(signal: NDArray[np.uint16], is_pq: bool) -> Image:
     """(H,W,3) uint8 BT.709 RGB of (H,W,3) uint16 full-range BT.2020 RGB in HLG or PQ."""
     from arview.video._tone_map import apply_tables

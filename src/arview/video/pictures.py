@@ -20,6 +20,8 @@ from arview.core.extras import load
 from arview.errors import InputError, MissingDependencyError
 from arview.video.frame import Frame, Image
 from arview.video.source import FrameRange, FrameSource, read_ahead
+from arview.video.tiff import SUFFIXES as TIFF_SUFFIXES
+from arview.video.tiff import tiff_pages
 
 RAW_SUFFIXES = frozenset({".dng"})
 SUFFIXES = PHOTO_SUFFIXES | HEIF_SUFFIXES | RAW_SUFFIXES
@@ -42,9 +44,9 @@ class PictureSource(FrameSource):
     """Frames from picture files in the given order; the EXIF orientation is applied.
 
     Where the names differ in one number only, that number is the index of the frame, so that gaps stay gaps in index
-    and time; else the index is the position. Times are those of ``fps`` frames per second from the first picture on.
-    Pictures that cannot be read or differ in size from the first are skipped and counted. Pictures of 16 bits are
-    reduced to 8 by the bits that are used: 12-bit values in 16 bits are not left dark.
+    and time; else the index is the position. Each page of a TIFF is a picture. Times are those of ``fps`` frames per
+    second from the first picture on. Pictures that cannot be read or differ in size from the first are skipped and
+    counted. Pictures of 16 bits are reduced to 8 by the bits that are used: 12-bit values in 16 bits are not left dark.
 
     Attributes:
         first_path: the first picture that can be read.
@@ -57,11 +59,12 @@ class PictureSource(FrameSource):
     def __init__(self, name: str, paths: Sequence[Path], wanted: FrameRange, fps: float) -> None:
         self.name = name
         self.fps = self._pictures_per_s = fps
-        numbers = frame_numbers(paths)
-        indices = list(range(len(paths))) if numbers is None else numbers
+        pages = [(path, page) for path in paths for page in tiff_pages(path)]
+        numbers = frame_numbers(paths) if len(pages) == len(paths) else None
+        indices = list(range(len(pages))) if numbers is None else numbers
         self._first_index = indices[0]
         kept = [
-            (i, path) for i, path in zip(indices, paths, strict=True) if i >= wanted.start and not wanted.is_past(i)
+            (i, page) for i, page in zip(indices, pages, strict=True) if i >= wanted.start and not wanted.is_past(i)
         ]
         # Every stride-th picture that is there, because numbers may have a stride of their own.
         self._pictures = kept[:: wanted.stride]
@@ -73,11 +76,12 @@ class PictureSource(FrameSource):
                 f"the numbers of its {len(paths)} pictures go from {min(numbers)} to {max(numbers)}"
             )
         if not kept:
-            raise InputError(f"{name}: start {wanted.start} is past the last of its {len(paths)} pictures")
+            raise InputError(f"{name}: start {wanted.start} is past the last of its {len(pages)} pictures")
         self._fault = "cannot be read"
+        self._held = (Path(), b"")
         self._used_bits = self._probed_bits()
-        for path in paths:
-            first = self._read(path)
+        for path, page in pages:
+            first = self._read(path, page)
             if first is not None:
                 break
         else:
@@ -96,8 +100,8 @@ class PictureSource(FrameSource):
     def _frames(self) -> Iterator[Frame]:
         self.skipped, self.notes = 0, (self._aspect_note,) if self._aspect_note else ()
         has_told_size = False
-        for index, path in self._pictures:
-            image = self._read(path)
+        for index, (path, page) in self._pictures:
+            image = self._read(path, page)
             if image is None or image.shape != (self.height, self.width, 3):
                 self.skipped += 1
                 if image is not None and not has_told_size:
@@ -112,19 +116,21 @@ class PictureSource(FrameSource):
 
     def _probed_bits(self) -> int:
         """Bits that 16-bit pictures of the sequence use; 8 if it has none."""
-        paths = [path for _, path in self._pictures if path.suffix.lower() in {".png", ".tif", ".tiff"}]
+        deep = [picture for _, picture in self._pictures if picture[0].suffix.lower() in {".png", *TIFF_SUFFIXES}]
         used = USED_BITS[0]
-        for path in paths[:: max(len(paths) // PROBED_PICTURES, 1)][:PROBED_PICTURES]:
+        for path, page in deep[:: max(len(deep) // PROBED_PICTURES, 1)][:PROBED_PICTURES]:
             data = self._checked_bytes(path)
             if data is None or (data.startswith(_PNG_SIGNATURE) and data[24:25] != b"\x10"):
                 continue
-            pixels = _decoded(data)
+            pixels = _decoded(data, page)
             if pixels is not None and pixels.dtype == np.uint16:
                 used = max(used, used_bits(pixels, significant_bits(data)))
         return used
 
     def _checked_bytes(self, path: Path) -> bytes | None:
         """The content of a file that `check_picture` lets pass; else None, and why is kept."""
+        if self._held[0] == path:  # another page of the same file
+            return self._held[1]
         try:
             data = path.read_bytes()
             check_picture(data)
@@ -133,10 +139,11 @@ class PictureSource(FrameSource):
         except InputError as error:
             self._fault = str(error).partition(";")[0]
         else:
+            self._held = (path, data) if path.suffix.lower() in TIFF_SUFFIXES else self._held
             return data
         return None
 
-    def _read(self, path: Path) -> Image | None:
+    def _read(self, path: Path, page: int) -> Image | None:
         """(H,W,3) uint8 RGB, upright; None if the file is not a readable picture."""
         data = self._checked_bytes(path)
         if data is None:
@@ -145,7 +152,7 @@ class PictureSource(FrameSource):
             return _read_heif(data)
         if path.suffix.lower() in RAW_SUFFIXES:
             return _read_raw(data)
-        pixels = _decoded(data)
+        pixels = _decoded(data, page)
         if pixels is None:
             return None
         if pixels.dtype == np.uint16:
@@ -309,11 +316,14 @@ def quiet_opencv() -> Iterator[None]:
         cv2.utils.logging.setLogLevel(level)
 
 
-def _decoded(data: bytes) -> NDArray[Any] | None:
+def _decoded(data: bytes, page: int) -> NDArray[Any] | None:
     """(H,W,3) BGR as stored, of 8 or 16 bits or floating point, upright; None if it is not a picture."""
+    content, flags = np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH
     try:
         with quiet_opencv():
-            return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
+            if page == 0:
+                return cv2.imdecode(content, flags)
+            return next(iter(cv2.imdecodemulti(content, flags, range=(page, page + 1))[1]), None)
     except cv2.error:
         return None
 

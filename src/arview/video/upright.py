@@ -7,8 +7,9 @@ from fractions import Fraction
 import cv2
 from av.video.frame import VideoFrame
 
-from arview.video.color import rgb_from_video_frame
+from arview.video.color import deep_gray_or_rgb, rgb_from_video_frame
 from arview.video.frame import Image
+from arview.video.pictures import USED_BITS, used_bits
 
 MAX_PIXEL_ASPECT = 4.0
 """Widest, and by its inverse narrowest, pixel that is believed; professional formats lie between 0.9 and 2.2."""
@@ -22,19 +23,12 @@ def turns_of(frame: VideoFrame) -> int:
     return round(-frame.rotation / 90.0) % 4
 
 
-def upright_image(frame: VideoFrame, quarter_turns_clockwise: int) -> Image:
-    """(H,W,3) uint8 RGB of a decoded frame, rotated by quarter turns."""
-    image = rgb_from_video_frame(frame)
-    if quarter_turns_clockwise:
-        image = cv2.rotate(image, _CV2_ROTATIONS[quarter_turns_clockwise])
-    return image
-
-
 class UprightPictures:
     """Converts the frames of a stream to pictures that are all like the first one.
 
-    Pixels that are not square are made so by enlarging the shorter side. Where the size of the frames changes, they are
-    scaled to the first size if they show the same aspect ratio.
+    Values of 16 bits are reduced to 8 by the bits that are used, as those of pictures are. Pixels that are not square
+    are made so by enlarging the shorter side. Where the size of the frames changes, they are scaled to the first size
+    if they show the same aspect ratio.
 
     Args:
         first: first frame.
@@ -49,6 +43,7 @@ class UprightPictures:
 
     def __init__(self, first: VideoFrame, pixel_aspect: Fraction | None) -> None:
         self.note = ""
+        self._used_bits = USED_BITS[0]
         self.quarter_turns_clockwise = turns_of(first)
         self._decoded_size = (first.width, first.height)
         aspect = float(pixel_aspect) if pixel_aspect else 1.0
@@ -73,7 +68,15 @@ class UprightPictures:
             self._note_change(size, index, is_alike)
             if not is_alike:
                 return None
-        image = upright_image(frame, self.quarter_turns_clockwise)
+        deep = deep_gray_or_rgb(frame)
+        if deep is None:
+            image = rgb_from_video_frame(frame)
+        else:
+            self._used_bits = max(self._used_bits, used_bits(deep, None))
+            image = cv2.convertScaleAbs(deep, alpha=255.0 / (2**self._used_bits - 1))
+            image = cv2.cvtColor(image, cv2.COLOR_GRAY2RGB) if image.ndim == 2 else image
+        if self.quarter_turns_clockwise:
+            image = cv2.rotate(image, _CV2_ROTATIONS[self.quarter_turns_clockwise])
         if image.shape[:2] == (self.height, self.width):
             return image
         is_smaller = image.shape[0] * image.shape[1] > self.width * self.height

@@ -18,7 +18,7 @@ from lxml import etree
 from arview.acceptance.lengths import read_known, read_measured
 from arview.acceptance.position_list import read_position_list
 from arview.cad import load_part
-from arview.cad.formats.step_text import prepare_step, products_without_shape, step_unit_mm
+from arview.cad.formats.step_text import prepare_step, step_unit_mm
 from arview.cad.load import load_cad
 from arview.camera.read import load_camera
 from arview.errors import InputError
@@ -167,8 +167,7 @@ def read_lengths(path: Path, seeds: Path) -> None:
 def read_step_text(path: Path, seeds: Path) -> None:
     """What is read of a STEP file without OpenCASCADE: encoding, instances, solids, unit, products without shape."""
     data = path.read_bytes()
-    prepared = prepare_step(data, path)
-    products_without_shape(prepared)
+    prepared, _ = prepare_step(data, path)
     with suppress(InputError):
         step_unit_mm(prepared, path)
 

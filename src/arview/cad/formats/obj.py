@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from arview.cad.formats.raw import RawComponent, RawModel
-from arview.cad.formats.text_encoding import decode_text, text_encoding
+from arview.cad.formats.text_encoding import decode_text, text_encoding, with_decimal_points
 from arview.errors import InputError
 from arview.geometry import Array
 
@@ -35,7 +35,7 @@ def read_obj(path: Path) -> RawModel:
     Raises:
         InputError: a line that is not OBJ, or a face that refers to a vertex that does not exist.
     """
-    data = path.read_bytes()
+    data, notes = with_decimal_points(path.read_bytes(), rb"v[ \t]")
     encoding = text_encoding(data)
     text = _CONTINUED.sub(" ", decode_text(data, encoding))
     lines = _LINE_END.split(text)
@@ -76,7 +76,9 @@ def read_obj(path: Path) -> RawModel:
         except (ValueError, IndexError) as error:
             raise InputError(f"{path}: line {number} is not valid OBJ: {line.strip()[:60]!r} ({error})") from error
     points = np.frombuffer(coordinates, dtype=np.float64).reshape(-1, 3)
-    return _model(points, groups, materials, path)
+    model = _model(points, groups, materials, path)
+    model.notes += notes
+    return model
 
 
 @dataclass(eq=False)

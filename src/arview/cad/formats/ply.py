@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from arview.cad.formats.raw import RawComponent, RawModel
+from arview.cad.formats.text_encoding import with_decimal_points
 from arview.errors import InputError
 
 
@@ -18,15 +19,18 @@ def read_ply(path: Path) -> RawModel:
     """A PLY file read by trimesh: one mesh without a unit."""
     import trimesh
 
+    data, notes = path.read_bytes(), list[str]()
+    if b"format ascii" in data[:256]:
+        data, notes = with_decimal_points(data, rb"[-+]?\d")
     try:
         with _quiet_trimesh():
-            scene = trimesh.load_scene(BytesIO(path.read_bytes()), file_type="ply", process=False)
+            scene = trimesh.load_scene(BytesIO(data), file_type="ply", process=False)
     except Exception as error:  # trimesh raises whatever its parsers stumble over
         printed = next(iter(str(error).splitlines()), "")
         raise InputError(
             f"{path}: broken or truncated PLY ({type(error).__name__}: {printed}); export it again"
         ) from error
-    raw = RawModel()
+    raw = RawModel(notes=notes)
     several = len(scene.geometry) > 1
     for name, mesh in scene.geometry.items():
         faces = np.asarray(getattr(mesh, "faces", []), dtype=np.int64).reshape(-1, 3)

@@ -12,13 +12,15 @@ import numpy as np
 from arview.cad.formats.gltf import parse_gltf
 from arview.cad.formats.limited_process import HUNG, IDLE_S, TIMED_OUT, ProcessLimits, run_limited
 from arview.cad.formats.raw import RawModel
-from arview.cad.formats.step_text import prepare_step, products_without_shape, step_unit_mm
+from arview.cad.formats.step_scene import HIDDEN
+from arview.cad.formats.step_text import prepare_step, step_unit_mm
 from arview.errors import InputError
 
 StepLimits = ProcessLimits
 DEFAULT = StepLimits()
 _PLACEHOLDER_NAME = re.compile(r"Open ?CASCADE STEP translator [\d. ]+|NONE|=>\[[\d:]+\]", re.IGNORECASE)
 """Names that writers give to products that have none."""
+_ANALYSIS = re.compile(rb"FILE_SCHEMA\s*\(\s*\(\s*'(?:AP209|STRUCTURAL_ANALYSIS_DESIGN)", re.IGNORECASE)
 _USUAL_TOL_MM, _USUAL_TOL_DEG = 0.01, 1.0
 """Tolerances below these are named in a message when the triangulation fails."""
 _OUT_OF_MEMORY = ("bad_alloc", "MemoryError", "failed to map", "Cannot allocate memory")
@@ -50,19 +52,18 @@ def read_step(
         InputError: a broken or truncated file, or one that takes too much time or memory.
     """
     data = path.read_bytes()
-    prepared = prepare_step(data, path)
+    prepared, notes = prepare_step(data, path)
     raw = parse_gltf(_triangulated(prepared, path, tol_linear_mm, tol_angular_deg, limits), path)
     raw.up = "z"
+    raw.components = [mesh for mesh in raw.components if HIDDEN not in mesh.path]
+    raw.triangle_count = sum(len(mesh.faces) for mesh in raw.components)
     factor = 1000.0 / step_unit_mm(data, path) if is_overridden else 1.0
     for index, mesh in enumerate(raw.components):
         named = tuple(name for name in mesh.path if not _PLACEHOLDER_NAME.fullmatch(name.strip()))
         raw.components[index] = replace(mesh, path=named, vertices=mesh.vertices * factor)
-    missing = products_without_shape(prepared)
-    if missing:
-        raw.notes.append(
-            f"{len(missing)} products of the STEP file have no shape in it and are left out; is it in other files? "
-            f"Export one file with all: {', '.join(missing[:4])}{' …' if len(missing) > 4 else ''}"
-        )
+    raw.notes += notes
+    if not raw.triangle_count and _ANALYSIS.search(data[:8192]):
+        raw.notes.append("AP209, a model for finite elements, holds no shape; export AP214 or AP242")
     return raw
 
 
@@ -95,5 +96,7 @@ def _triangulated(data: bytes, path: Path, tol_linear_mm: float, tol_angular_deg
         if not reason and any(word in printed for word in _OUT_OF_MEMORY):
             reason = f"it needs more than {limits.memory_of(size_mb) / 1000:.1f} GB of memory"
         reason = reason or (f"OpenCASCADE crashed, code {code}" if code else "no shape in it")
+        if _ANALYSIS.search(data[:8192]):
+            raise InputError(f"{path}: AP209, a model for finite elements, holds no shape; export AP214 or AP242")
         raise InputError(f"{path}: broken or truncated STEP ({reason}); export it again")
     return glb

@@ -1,7 +1,7 @@
 """STEP files as text (ISO 10303-21): whether they are whole, their unit, and named solids as products of their own.
 
 OpenCASCADE takes minutes over files whose parentheses never close, and its glTF holds one mesh for each product,
-however many named solids that has. Both are dealt with before it reads the file.
+however many named solids that has. Both are dealt with before it reads the file, as are names and hidden bodies.
 """
 
 from __future__ import annotations
@@ -11,7 +11,16 @@ from pathlib import Path
 
 import numpy as np
 
-from arview.cad.formats.raw import check_instance_count, unit_in_mm
+from arview.cad.formats.raw import check_instance_count, short_list, unit_in_mm
+from arview.cad.formats.step_external import OtherFiles, products_without_shape
+from arview.cad.formats.step_scene import drop_repeated, hide_bodies, name_uses
+from arview.cad.formats.step_statements import (
+    SHAPE,
+    SOLID,
+    USE,
+    Products,
+    plain_name,
+)
 from arview.cad.formats.text_encoding import decode_text, text_encoding
 from arview.errors import InputError
 
@@ -20,65 +29,31 @@ _CHUNK = 1 << 22
 _STRINGS_AND_COMMENTS = re.compile(rb"'[^']*(?:'|\Z)|/\*(?:.*?\*/|.*\Z)", re.S)
 _PREFIX_MM = {"$": 1000.0, ".MILLI.": 1.0, ".CENTI.": 10.0, ".DECI.": 100.0, ".MICRO.": 0.001, ".KILO.": 1e6}
 
-_TEXT = rb"\s*('(?:[^']|'')*')\s*"
-_REF = rb"\s*#(\d+)\s*"
-_SOLID = re.compile(rb"#(\d+)\s*=\s*(?:MANIFOLD_SOLID_BREP|BREP_WITH_VOIDS|FACETED_BREP)\s*\(" + _TEXT + rb",")
-_SHAPE = re.compile(
-    rb"#(\d+)\s*=\s*(?:ADVANCED_BREP_|FACETED_BREP_)?SHAPE_REPRESENTATION\s*\("
-    + _TEXT
-    + rb",\s*\(([#\d,\s]*)\)\s*,"
-    + _REF
-    + rb"\)\s*;"
-)
-_PLACEMENT = re.compile(rb"#(\d+)\s*=\s*AXIS2_PLACEMENT_3D\s*\(")
-_SHAPE_OF = re.compile(rb"=\s*SHAPE_DEFINITION_REPRESENTATION\s*\(" + _REF + rb"," + _REF + rb"\)")
-_SAME_SHAPE = re.compile(
-    rb"=\s*SHAPE_REPRESENTATION_RELATIONSHIP\s*\(" + _TEXT + rb",[^,]*," + _REF + rb"," + _REF + rb"\)"
-)
-_DEFINITION_SHAPE = re.compile(rb"#(\d+)\s*=\s*PRODUCT_DEFINITION_SHAPE\s*\(" + _TEXT + rb",[^,]*," + _REF + rb"\)")
-_DEFINITION = re.compile(
-    rb"#(\d+)\s*=\s*PRODUCT_DEFINITION(?:_WITH_ASSOCIATED_DOCUMENTS)?\s*\("
-    + _TEXT
-    + rb",\s*(?:'(?:[^']|'')*'|\$)\s*,"
-    + _REF
-    + rb","
-    + _REF
-    + rb"[,)]"
-)
-_FORMATION = re.compile(
-    rb"#(\d+)\s*=\s*PRODUCT_DEFINITION_FORMATION(?:_WITH_SPECIFIED_SOURCE)?\s*\("
-    + _TEXT
-    + rb",\s*(?:'(?:[^']|'')*'|\$)\s*,"
-    + _REF
-)
-_PRODUCT = re.compile(
-    rb"#(\d+)\s*=\s*PRODUCT\s*\(" + _TEXT + rb"," + _TEXT + rb",\s*(?:'(?:[^']|'')*'|\$)\s*,\s*\(" + _REF
-)
-_USE = re.compile(
-    rb"=\s*NEXT_ASSEMBLY_USAGE_OCCURRENCE\s*\("
-    + _TEXT
-    + rb",\s*(?:'(?:[^']|'')*'|\$)\s*,\s*(?:'(?:[^']|'')*'|\$)\s*,"
-    + _REF
-    + rb","
-    + _REF
-    + rb","
-)
 
-
-def prepare_step(data: bytes, path: Path) -> bytes:
-    """A STEP file that OpenCASCADE can read in bounded time, in UTF-8, with named solids as products.
+def prepare_step(data: bytes, path: Path) -> tuple[bytes, list[str]]:
+    """A STEP file that OpenCASCADE can read in bounded time, in UTF-8, with named solids as products; and remarks.
 
     Raises:
         InputError: not STEP, parentheses that never close, an assembly in itself, or too many components.
     """
-    if b"ISO-10303-21" not in data[:4096]:
-        raise InputError(f"{path}: not a STEP file (ISO-10303-21 is missing at its start)")
-    _check_whole(data, path)
-    encoding = text_encoding(data)
-    if encoding != "utf-8":
-        data = decode_text(data, encoding).encode("utf-8")
+    others = OtherFiles(lambda file: _checked_text(file.read_bytes(), file))
+    data = others.added(_checked_text(data, path), path)
     _check_instances(data, path)
-    return split_solids(data)
+    notes, products = list[str](), Products(data)
+    if others.missing:
+        told = short_list([f"{file} ({name})" for name, file in others.missing.items()])
+        why = "their STEP files are not beside it, or do not hold one product"
+        notes.append(f"left out, because {why}; put them there: {told}")
+    missing = [
+        plain_name(products.name_of(one)).decode("utf-8", errors="replace") for one in products_without_shape(data)
+    ]
+    if missing := [name for name in missing if name not in others.missing]:
+        notes.append(
+            f"{len(missing)} products of the STEP file have no shape in it and are left out; is it in other files? "
+            f"Export one file with all: {short_list(missing)}"
+        )
+    data, hidden = hide_bodies(drop_repeated(data))
+    return split_solids(name_uses(data)), notes + hidden
 
 
 def step_unit_mm(data: bytes, path: Path) -> float:
@@ -95,21 +70,13 @@ def step_unit_mm(data: bytes, path: Path) -> float:
     return float(next(value for value in units if value is not None))
 
 
-def products_without_shape(data: bytes) -> list[str]:
-    """Names of products that assemblies use, that hold no others, and that have no shape: it is in other files."""
-    uses = [(match[2], match[3]) for match in _USE.finditer(data)]
-    if not uses:
-        return []
-    parents = {parent for parent, _ in uses}
-    placements = {m[1] for m in _PLACEMENT.finditer(data)}
-    products = _Products(data)
-    items = {m[1]: set(re.findall(rb"\d+", m[3])) for m in _SHAPE.finditer(data)}
-    # A representation of nothing but its own frame stands for a shape in another file.
-    empty = {one for one, held in items.items() if held <= placements and one not in products.linked}
-    without_shape = {products.definition.get(m[1]) for m in _SHAPE_OF.finditer(data) if m[2] in empty}
-    missing = dict.fromkeys(child for _, child in uses if child not in parents and child in without_shape)
-    texts = [products.name_of(one) for one in missing]
-    return [text[1:-1].decode("utf-8", errors="replace") for text in texts]
+def _checked_text(data: bytes, path: Path) -> bytes:
+    """The content of a STEP file in UTF-8; raises InputError when it is no STEP, or not whole."""
+    if b"ISO-10303-21" not in data[:4096]:
+        raise InputError(f"{path}: not a STEP file (ISO-10303-21 is missing at its start)")
+    _check_whole(data, path)
+    encoding = text_encoding(data)
+    return data if encoding == "utf-8" else decode_text(data, encoding).encode("utf-8")
 
 
 def _check_whole(data: bytes, path: Path) -> None:
@@ -129,8 +96,8 @@ def _check_whole(data: bytes, path: Path) -> None:
 def _check_instances(data: bytes, path: Path) -> None:
     """Raise InputError when an assembly holds itself, or all of them place too many components."""
     children: dict[bytes, list[bytes]] = {}
-    for match in _USE.finditer(data):
-        children.setdefault(match[2], []).append(match[3])
+    for match in USE.finditer(data):
+        children.setdefault(match[5], []).append(match[6])
     counts: dict[bytes, int] = {}
     for top in children:
         stack = [top]
@@ -153,14 +120,16 @@ def split_solids(data: bytes) -> bytes:
 
     Each solid moves from the representation of its product to one of its own, which is placed at the same spot.
     """
-    solids: dict[bytes, bytes] = {match[1]: match[2] for match in _SOLID.finditer(data)}
+    found = list(SOLID.finditer(data))
+    solids: dict[bytes, bytes] = {match[1]: match[3] for match in found}
+    meshes = {match[1] for match in found if match[2]}
     if len(solids) < 2:
         return data
-    shapes = [(match, [i for i in re.findall(rb"\d+", match[3]) if i in solids]) for match in _SHAPE.finditer(data)]
-    shapes = [(match, items) for match, items in shapes if len({_plain_name(solids[i]) for i in items}) > 1]
+    shapes = [(match, [i for i in re.findall(rb"\d+", match[3]) if i in solids]) for match in SHAPE.finditer(data)]
+    shapes = [(match, items) for match, items in shapes if len({plain_name(solids[i]) for i in items}) > 1]
     if not shapes:
         return data
-    products = _Products(data)
+    products = Products(data)
     new_id = 1 + max(int(i) for i in re.findall(rb"#(\d+)\s*=", data))
     pieces: list[bytes] = []
     added: list[bytes] = []
@@ -182,16 +151,16 @@ def split_solids(data: bytes) -> bytes:
         )
         end = match.end()
         for item in items:
-            name = solids[item] if _plain_name(solids[item]) else product_name
+            name = solids[item] if plain_name(solids[item]) else product_name
             parts = _product_of_solid(
                 new_id,
                 name,
                 b"#" + item,
                 origin=origin,
                 context=match[4],
+                kind=b"TESSELLATED" if item in meshes else b"ADVANCED_BREP",
                 parent=(definition, shape),
-                definition_context=definition_context,
-                product_context=product_context,
+                contexts=(definition_context, product_context),
             )
             added += _statements(new_id, parts)
             new_id += len(parts)
@@ -206,14 +175,14 @@ def _product_of_solid(
     solid: bytes,
     origin: bytes,
     context: bytes,
+    kind: bytes,
     parent: tuple[bytes, bytes],
-    definition_context: bytes,
-    product_context: bytes,
+    contexts: tuple[bytes, bytes],
 ) -> list[bytes]:
     """Statements, numbered from ``first``, of a product of one solid and of its use in a parent (definition, shape)."""
-    n = first
+    n, (definition_context, product_context) = first, contexts
     return [
-        b"ADVANCED_BREP_SHAPE_REPRESENTATION(%s,(%s,%s),#%s)" % (name, origin, solid, context),
+        b"%s_SHAPE_REPRESENTATION(%s,(%s,%s),#%s)" % (kind, name, origin, solid, context),
         b"PRODUCT(%s,%s,'',(#%s))" % (name, name, product_context),
         b"PRODUCT_DEFINITION_FORMATION('','',#%d)" % (n + 1),
         b"PRODUCT_DEFINITION('','',#%d,#%s)" % (n + 2, definition_context),
@@ -228,45 +197,5 @@ def _product_of_solid(
     ]
 
 
-class _Products:
-    """The products of a file by the numbers of their definitions and shape representations."""
-
-    def __init__(self, data: bytes) -> None:
-        self.definition_of_shape = {m[2]: m[1] for m in _SHAPE_OF.finditer(data)}
-        self.linked: dict[bytes, bytes] = {}
-        for match in _SAME_SHAPE.finditer(data):
-            self.linked[match[2]], self.linked[match[3]] = match[3], match[2]
-        self.definition = {m[1]: m[3] for m in _DEFINITION_SHAPE.finditer(data)}
-        self.formation = {m[1]: (m[3], m[4]) for m in _DEFINITION.finditer(data)}
-        self.product = {m[1]: m[3] for m in _FORMATION.finditer(data)}
-        self.name = {m[1]: (m[3], m[4]) for m in _PRODUCT.finditer(data)}
-
-    def name_of(self, definition: bytes) -> bytes:
-        """Name of a product in quotes; its number where it is not found."""
-        formation, _ = self.formation.get(definition, (b"", b""))
-        return self.name.get(self.product.get(formation, b""), (b"'#" + definition + b"'", b""))[0]
-
-    def of_shape(self, shape: bytes) -> tuple[bytes, bytes, bytes, bytes, bytes] | None:
-        """Definition, its own representation, its context, and the product's context and name; None when not found.
-
-        They are what a new product that is placed in it needs.
-        """
-        if shape not in self.definition_of_shape:
-            shape = self.linked.get(shape, shape)
-        try:
-            definition = self.definition[self.definition_of_shape[shape]]
-            formation, definition_context = self.formation[definition]
-            name, product_context = self.name[self.product[formation]]
-        except KeyError:
-            return None
-        return definition, shape, definition_context, product_context, name
-
-
 def _statements(first: int, contents: list[bytes]) -> list[bytes]:
     return [b"#%d=%s;" % (first + k, content) for k, content in enumerate(contents)]
-
-
-def _plain_name(text: bytes) -> bytes:
-    """A name without its quotes; empty for the placeholder NONE."""
-    name = text[1:-1].strip()
-    return b"" if name.upper() == b"NONE" else name

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from arview.cad.formats.raw import RawComponent, RawModel, check_triangle_count
-from arview.cad.formats.text_encoding import decode_text, text_encoding
+from arview.cad.formats.text_encoding import decode_text, text_encoding, with_decimal_points
 from arview.errors import InputError
 from arview.geometry import Array
 
@@ -57,6 +57,7 @@ def _binary(data: bytes, count: int, path: Path) -> RawModel:
 
 
 def _text(data: bytes, path: Path) -> RawModel:
+    data, notes = with_decimal_points(data, rb"vertex\b")
     facets, ends = (sum(1 for _ in pattern.finditer(data)) for pattern in (_FACET, _END_FACET))
     check_triangle_count(facets, path)
     solids = list(_SOLID.finditer(data))
@@ -68,7 +69,7 @@ def _text(data: bytes, path: Path) -> RawModel:
     bounds = [*(solid.start() for solid in solids), len(data)]
     meshes = [_corners(data, solid.end(), end, path) for solid, end in zip(solids, bounds[1:], strict=True)]
     found = [(decode_text(name, encoding), mesh) for name, mesh in zip(names, meshes, strict=True) if len(mesh)]
-    raw = RawModel()
+    raw = RawModel(notes=notes)
     for name, corners in found:
         faces = np.arange(len(corners), dtype=np.int64).reshape(-1, 3)
         raw.add(RawComponent((name,) if name and len(found) > 1 else (), corners, faces), path)
@@ -87,7 +88,8 @@ def _corners(data: bytes, start: int, end: int, path: Path) -> Array:
         try:
             numbers.extend(float(word) for corner in corners for word in corner)
         except ValueError as error:
-            raise InputError(f"{path}: broken STL (a coordinate is no number); export it again") from error
+            line = loop[1].decode("latin-1").split()
+            raise InputError(f"{path}: broken STL (no numbers: {' '.join(line)[:60]!r}); export it again") from error
         facets += 1
     if facets != sum(1 for _ in _END_FACET.finditer(data, start, end)):
         raise InputError(f"{path}: broken STL (a facet has no loop, or several); export it again")

@@ -37,6 +37,18 @@ def decode_text(data: bytes, encoding: str | None = None) -> str:
         return data.decode("latin-1")
 
 
+def with_decimal_points(data: bytes, line: bytes) -> tuple[bytes, list[str]]:
+    """A text with points for decimal commas in its lines that begin with a pattern, and a remark where it has some.
+
+    Where there are points, too, a comma may stand between thousands: it is left, and is no number.
+    """
+    lines = re.compile(rb"^[ \t]*" + line + rb"[^\r\n]*", re.MULTILINE | re.IGNORECASE)
+    found = b"\n".join(lines.findall(data)) if b"," in data else b""
+    if not re.search(rb"\d,\d", found) or re.search(rb"\d\.\d", found):
+        return data, []
+    return lines.sub(lambda match: match[0].replace(b",", b"."), data), ["its numbers have decimal commas"]
+
+
 def _is_valid(data: bytes, encoding: str) -> bool:
     try:
         data.decode(encoding)

@@ -1,8 +1,10 @@
 """Reader of 3MF: build items and component objects as named instances, units, display colours.
 
 Source: 3MF Core Specification 1.3, Materials extension (basematerials, colorgroup), Production extension
-(``p:path``). Written because general loaders drop the names of instances. The XML is read as a stream, so that memory
-grows with the triangles alone.
+(``p:path``). What is there only for printing, as supports and the modifiers of slicers, is left out and told.
+PrusaSlicer keeps all volumes of an object in one mesh, and what they are in ``Metadata/Slic3r_PE_model.config``; Bambu
+Studio and OrcaSlicer tell it of components in ``Metadata/model_settings.config``. Written because general loaders drop
+the names of instances. The XML is read as a stream, so that memory grows with the triangles alone.
 """
 
 from __future__ import annotations
@@ -23,11 +25,16 @@ from arview.cad.formats.raw import (
     RawModel,
     check_instance_count,
     check_triangle_count,
+    short_list,
     unit_in_mm,
 )
 from arview.errors import InputError
 from arview.geometry import Array
 
+_BODIES = ("model", "surface")
+"""Types of objects that are bodies; the others are support, solidsupport and other."""
+_CONFIGS = ("metadata/slic3r_pe_model.config", "metadata/slic3r_model.config", "metadata/model_settings.config")
+_CUTTERS = ("negativevolume", "negativepart")
 _MAX_DEPTH = 100
 _MAX_BYTES = 2_000_000_000
 _MAX_RATIO, _RATIO_FROM_BYTES = 100, 20_000_000
@@ -45,6 +52,7 @@ class _Object:
     name: str
     mesh: RawComponent
     children: list[tuple[Key, Array]]
+    kind: str
 
 
 def read_3mf(path: Path) -> RawModel:
@@ -76,9 +84,14 @@ class _Archive:
         self.objects: dict[Key, _Object] = {}
         self.counts: dict[Key, int] = {}
         self.model = RawModel()
+        self.volumes: dict[str, list[Attributes]] = {}
+        self.left_out: dict[str, None] = {}
+        self.uncut: dict[str, None] = {}
 
     def read(self) -> RawModel:
-        members = [info for info in self.archive.infolist() if info.filename.lower().endswith((".model", ".rels"))]
+        members = [
+            info for info in self.archive.infolist() if info.filename.lower().endswith((".model", ".rels", ".config"))
+        ]
         unpacked, packed = (sum(getattr(info, name) for info in members) for name in ("file_size", "compress_size"))
         if unpacked > _MAX_BYTES:
             raise InputError(f"{self.path}: more than 2 GB unpacked; decimate the mesh")
@@ -92,6 +105,9 @@ class _Archive:
         for name in names:
             if name.lower().endswith(".model") and name != main:
                 self._read_part(name)
+        for name in names:
+            if name.lower() in _CONFIGS:
+                self._read_config(name)
         part = self._read_part(main)
         self.model.unit_mm = unit_in_mm(part.unit)
         if self.model.unit_mm is None:
@@ -102,6 +118,12 @@ class _Archive:
             check_instance_count(total, self.path)
         for key, root_from_object, part_number in part.items:
             self._instantiate(key, root_from_object, (), part_number)
+        for told, text in (
+            (self.left_out, "left out, because they are no bodies but supports, modifiers or the like"),
+            (self.uncut, "the slicer cuts these out, which is not done here; export the body that is cut"),
+        ):
+            if told:
+                self.model.notes.append(f"{text}: {short_list(list(told))}")
         return self.model
 
     def _main_part(self, names: list[str]) -> str:
@@ -126,6 +148,21 @@ class _Archive:
         part = _ModelPart(self, name)
         self._parse(name, part.start, part.end)
         return part
+
+    def _read_config(self, name: str) -> None:
+        """Keep what a slicer says of each object and then of its volumes: attributes and metadata."""
+        held: list[Attributes] = []
+
+        def start(tag: str, attributes: Attributes) -> None:
+            nonlocal held
+            if tag == "object":
+                held = self.volumes[attributes["id"]] = []
+            if tag in ("object", "volume", "part"):
+                held.append(attributes)
+            elif tag == "metadata" and held and "key" in attributes:
+                held[-1].setdefault(attributes["key"], attributes.get("value", ""))
+
+        self._parse(name, start, lambda tag: None)
 
     def _parse(self, name: str, start: Callable[[str, Attributes], None], end: Callable[[str], None]) -> None:
         """Report the elements of an archive member by their names without namespaces."""
@@ -152,11 +189,24 @@ class _Archive:
 
     def _instantiate(self, key: Key, root_from_object: Array, path: tuple[str, ...], name: str | None) -> None:
         this = self.objects[key]
-        here = (*path, name or this.name)
-        if len(this.mesh.faces):
-            self.model.add(replace(this.mesh, path=tuple(n for n in here if n)), self.path, root_from_object)
+        settings, *volumes = self.volumes.get(key[1], [{}])
+        own_name = name or this.name or settings.get("name", "")
+        if this.kind not in _BODIES:
+            self.left_out[f"{own_name or key[1]} ({this.kind})"] = None
+            return
+        here = (*path, own_name)
+        is_body, others = np.ones(len(this.mesh.faces), dtype=bool), set[str]()
+        for volume, kind in ((volume, _kind_of(volume)) for volume in volumes if _kind_of(volume)):
+            (self.uncut if kind in _CUTTERS else self.left_out)[f"{volume.get('name') or 'unnamed'} ({kind})"] = None
+            others.add(volume.get("id", ""))
+            is_body[max(int(volume.get("firstid", 0)), 0) : max(int(volume.get("lastid", -1)) + 1, 0)] = False
+        if is_body.any():
+            mesh = replace(this.mesh, path=tuple(n for n in here if n), faces=this.mesh.faces[is_body])
+            self.model.add(mesh, self.path, root_from_object)
+        names = {volume.get("id"): volume.get("name") for volume in volumes}
         for child, object_from_child in this.children:
-            self._instantiate(child, root_from_object @ object_from_child, here, None)
+            if child[1] not in others:
+                self._instantiate(child, root_from_object @ object_from_child, here, names.get(child[1]))
 
 
 class _ModelPart:
@@ -211,8 +261,6 @@ class _ModelPart:
         if tag != "object" or self.attributes is None:
             return
         attributes, self.attributes = self.attributes, None
-        if attributes.get("type", "model") in ("support", "other"):
-            return
         vertices = np.array(self.points, dtype=np.float64).reshape(-1, 3)
         faces = np.array(self.corners, dtype=np.int64).reshape(-1, 3)
         group, index = max(self.uses, key=lambda key: self.uses[key]) if self.uses else (None, None)
@@ -221,6 +269,7 @@ class _ModelPart:
             name=attributes.get("name") or attributes.get("partnumber") or "",
             mesh=RawComponent((), vertices, faces, color),
             children=self.children,
+            kind=attributes.get("type", "model"),
         )
         self._clear()
 
@@ -231,6 +280,13 @@ class _ModelPart:
             if key.endswith("}path"):
                 part = posixpath.normpath(value).lstrip("/")
         return part, attributes["objectid"]
+
+
+def _kind_of(volume: Attributes) -> str:
+    """What a volume is for a slicer; empty for a body."""
+    kind = volume.get("volume_type") or volume.get("subtype") or ("modifier" if volume.get("modifier") == "1" else "")
+    plain = kind.replace("_", "").strip().lower()
+    return "" if plain in ("modelpart", "normalpart") else plain
 
 
 def _transform(attributes: Attributes) -> Array:
