@@ -12,7 +12,7 @@ import pytest
 from arview.cad.model import Component, Model, make_model
 from arview.errors import InputError
 from arview.geometry import Array, apply, exp_so3, log_so3, rigid
-from arview.measurement.photo import PhotoViews, fit_rim, measure_components_in_photos, sweep_offsets
+from arview.measurement.photo import PhotoViews, measure_components_in_photos, sweep_offsets
 from arview.measurement.photo.component import joint_mm
 from arview.measurement.photo.views import views_of
 from arview.measurement.types import Method, Move, NotMeasured
@@ -228,16 +228,6 @@ def test_samples_of_a_plane_say_where_it_is() -> None:
         assert np.count_nonzero(found.is_ok) > 120
         # Some lie under blocks that stand elsewhere than nominal: the median passes them by.
         assert np.median(found.offsets_mm[found.is_ok]) == pytest.approx(expected_mm, abs=0.02)
-
-
-def test_rim_of_the_post() -> None:
-    views, _ = textured()
-    rim = fit_rim(np.array([0.0, 5.0, 30.0]), np.array([0.0, 0.0, 1.0]), 24.0, views)
-    assert np.linalg.norm(rim.shift_mm - [1.0, -0.6, 0.0]) < 0.06, rim
-    assert np.abs(rim.shift_mm[:2] - [1.0, -0.6]).max() < 4.0 * np.sqrt(np.diag(rim.covariance)[:2]).max()
-    assert abs(rim.radius_shift_mm) < 0.15
-    with pytest.raises(InputError, match=r"rim of ⌀24 mm at \(600.0, 5.0, 30.0\)"):
-        fit_rim(np.array([600.0, 5.0, 30.0]), np.array([0.0, 0.0, 1.0]), 24.0, views)
 
 
 def test_bad_input_is_said() -> None:

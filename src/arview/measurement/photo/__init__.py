@@ -2,7 +2,6 @@
 
 from arview.measurement.photo.edges import EdgeOffsets, edge_offsets
 from arview.measurement.photo.measure import measure_components_in_photos
-from arview.measurement.photo.rims import RimFit, fit_rim
 from arview.measurement.photo.rival_edges import EdgePoints
 from arview.measurement.photo.sweep import SweepOffsets, sweep_offsets
 from arview.measurement.photo.views import PhotoViews, load_views
@@ -11,10 +10,8 @@ __all__ = [
     "EdgeOffsets",
     "EdgePoints",
     "PhotoViews",
-    "RimFit",
     "SweepOffsets",
     "edge_offsets",
-    "fit_rim",
     "load_views",
     "measure_components_in_photos",
     "sweep_offsets",
