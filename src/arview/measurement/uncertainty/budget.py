@@ -7,7 +7,7 @@ not count.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -284,13 +284,3 @@ def _draw(contributions: Sequence[Contribution], options: UncertaintyOptions, sa
         noise = rng.standard_normal(total.shape) if index == 0 else rng.uniform(-_BOUND, _BOUND, total.shape)
         total += noise @ covariance_root(covariance).T
     return total
-
-
-def total_budget(placements: Mapping[str, MeasuredPlacement]) -> tuple[tuple[str, float], ...]:
-    """Root mean square over components of each line of the budget, mm, largest first."""
-    sums: dict[str, list[float]] = {}
-    for placement in placements.values():
-        for name, value in placement.budget():
-            sums.setdefault(name, []).append(value**2)
-    means = {name: float(np.sqrt(np.mean(values))) for name, values in sums.items()}
-    return tuple(sorted(means.items(), key=lambda item: -item[1]))
