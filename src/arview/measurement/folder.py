@@ -106,7 +106,7 @@ def read_cloud(
     """Read a cloud without photos, in any frame, with or without normals.
 
     Args:
-        path: PLY, PCD, XYZ, PTS, CSV, LAS, LAZ or E57.
+        path: a file as `measurement.cloud.reading.read_points` reads it.
         model: the CAD, by whose size the unit is found; without it the unit is mm.
         unit: of the file, see `measurement.cloud.reading.UNITS_MM`; None: as the file declares it, or by size.
         rescales: divide the cloud by the factor by which it is larger than the CAD's base.

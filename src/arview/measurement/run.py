@@ -18,7 +18,7 @@ from arview.core.progress import Progress
 from arview.errors import InputError
 from arview.geometry import Array
 from arview.inspection import DistanceReport, FailedDatum, ForeignReport, Inspection
-from arview.measurement.cloud_report import inspect_cloud
+from arview.measurement.cloud_report import inspect_cloud, scatter_doubts
 from arview.measurement.datums.alignment import Alignment, align
 from arview.measurement.datums.datum_fit import check_covered
 from arview.measurement.datums.equations import DatumEquations, move_equations
@@ -129,6 +129,8 @@ def _measure(reconstruction: MetricReconstruction, part: Part, options: MeasureO
     if reconstruction.cloud is not None and "cloud" in options.methods:
         tell("distance map", 0, 1)
         foreign, distances = inspect_cloud(reconstruction.cloud, part.model, alignment, deviations, options.maps_folder)
+        if views is None and distances is not None:
+            warnings += scatter_doubts(distances, part.model.diameter_mm)
         for index, name in enumerate(names):
             if is_covered(part.model.component(name).centroid_in_model.tolist(), foreign):
                 deviations[index] = with_covered(deviations[index])
