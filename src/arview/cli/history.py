@@ -262,16 +262,16 @@ def chart(
         raise InputError("--first and --repeats exclude each other: give one of them")
     with _open(store, must_exist=True) as opened:
 
-        def series_of(first: bool) -> quality.ComponentSeries:
+        def series_of(counted: str) -> quality.ComponentSeries:
             moment = _moment(since, zone)
             found = quality.series_of(
-                opened, component, quantity, part, station, moment, repeats, revisions, first  # type: ignore[arg-type]
+                opened, component, quantity, part, station, moment, counted, revisions  # type: ignore[arg-type]
             )  # fmt: skip
             return found.with_limits(lower, upper).in_zone(zone)
 
-        series = series_of(first)
+        series = series_of("first" if first else "all" if repeats else "last")
         again = series.earlier > 0 and not first
-        made = series_of(True) if again else series
+        made = series_of("first") if again else series
     for reason in series.left_out:
         say(f"left out: {reason}{' (--revisions counts them)' if 'CAD model' in reason else ''}")
     values = [one.value for one in series.values]

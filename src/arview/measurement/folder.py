@@ -35,6 +35,8 @@ from arview.reconstruction import (
     read_model,
 )
 
+BY_SHAPE = "the part was found by the shape of the cloud alone"
+"""Warning that nothing but its shape says how the part lies in the cloud."""
 _NORMALS_WITHIN_MM = 3.0
 """Distance from the CAD within which the side of a cloud's normals is compared with the surface's."""
 _SCALE_STD = 1e-3
@@ -192,7 +194,7 @@ def in_model_frame(reconstruction: MetricReconstruction, part: Part) -> MetricRe
             "cloud: lengths are in an arbitrary unit, and the part file has no two datums whose distance gives the "
             "scale; reconstruct with a board, a tag or a scale bar"
         )
-    warnings = [*scale.warnings, "the part was found by the shape of the cloud alone"]
+    warnings = [*scale.warnings, BY_SHAPE]
     if scale.scale is None:
         found = find_model_in_cloud(cloud, part.model, None)
     else:

@@ -540,7 +540,7 @@ def test_a_series(filled: HistoryStore, tmp_path: Path) -> None:
     assert series.left_out == (
         "1 earlier measurements of the same serials, none of them out of tolerance", "1 in which it was missing",
     )  # fmt: skip
-    assert len(series_of(filled, "block_1", "dx", repeats=True).values) == 31
+    assert len(series_of(filled, "block_1", "dx", counted="all").values) == 31
     distance = series_of(filled, "block_1")
     assert (distance.lower, distance.upper) == (None, 0.5)
     assert series_of(filled, "block_1", "tilt").upper is None
@@ -563,7 +563,7 @@ def _reworked(store: HistoryStore, folder: Path) -> None:
 
 def test_rework_is_told_and_the_index_is_of_the_first_measurements(store: HistoryStore, tmp_path: Path) -> None:
     _reworked(store, tmp_path)
-    last, first = series_of(store, "block_1", "dx"), series_of(store, "block_1", "dx", first=True)
+    last, first = series_of(store, "block_1", "dx"), series_of(store, "block_1", "dx", counted="first")
     assert last.left_out == ("4 earlier measurements of the same serials, 4 of them out of tolerance",)
     assert (last.within, first.within, last.earlier) == ((12, 12), (8, 12), 4)
     assert first.left_out == ("4 later measurements of the same serials, none of them out of tolerance",)

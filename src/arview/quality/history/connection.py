@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import sqlalchemy as sa
-from sqlalchemy.exc import ArgumentError
+from sqlalchemy.exc import ArgumentError, DBAPIError, OperationalError, SQLAlchemyError
 
 from arview.errors import InputError
 
@@ -17,6 +17,9 @@ BUSY_S = 2.0
 """Time that a writer waits for others before it says so and tries again; a result is written in milliseconds."""
 READ_BUSY_S = 30.0
 """Time that a reader waits, which a writer hardly ever makes it do."""
+
+_TEMPORARY = ("locked", "busy", "deadlock", "serialize", "could not connect", "server closed", "terminating connection")
+"""Words of errors after which another attempt may succeed."""
 
 
 def store_url(where: str) -> sa.URL:
@@ -94,3 +97,8 @@ def default_author() -> str:
     except (KeyError, OSError, ImportError):
         user = "unknown"
     return f"{user}@{socket.gethostname()}"
+
+
+def is_temporary(error: SQLAlchemyError) -> bool:
+    """Whether another attempt may succeed after an error of the database."""
+    return isinstance(error, OperationalError | DBAPIError) and any(word in str(error).lower() for word in _TEMPORARY)

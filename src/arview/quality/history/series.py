@@ -143,16 +143,14 @@ def series_of(
     part: str | None = None,
     station: str | None = None,
     since: datetime | None = None,
-    repeats: bool = False,
+    counted: Literal["last", "first", "all"] = "last",
     revisions: bool = False,
-    first: bool = False,
 ) -> ComponentSeries:
     """A quantity of a component, for the newest CAD model in the store, or for all with ``revisions``.
 
-    Of a serial number that was measured several times only the last measurement counts, with ``first`` only the first,
-    which is what the process made before any rework, with ``repeats`` every one. Each value has the limits that held
-    when it was measured. Those of dx, dy, dz are ± the tolerance of the distance, which is necessary but not sufficient
-    for the distance.
+    Of a serial number that was measured several times only the last measurement is ``counted``, or only the first, which
+    is what the process made before any rework, or all. Each value has the limits that held when it was measured. Those
+    of dx, dy, dz are ± the tolerance of the distance, which is necessary but not sufficient for the distance.
 
     Raises:
         InputError: the store has no such results; or it has several parts and ``part`` is not given.
@@ -170,7 +168,7 @@ def series_of(
     current = found if revisions else [one for one in found if one.model_hash == found[-1].model_hash]
     if len(current) < len(found):
         left_out.append(f"{len(found) - len(current)} measured against another CAD model than the newest")
-    kept = current if repeats else _one_of_each_serial(current if first else current[::-1])
+    kept = current if counted == "all" else _one_of_each_serial(current if counted == "first" else current[::-1])
     rows = {row["result_id"]: row for row in store.components([one.id for one in current], component)}
     if not any(one.id in rows for one in kept):
         raise InputError(f"{store.name}: {parts[0]!r} has no component {component!r}")
@@ -178,7 +176,7 @@ def series_of(
         ids = {one.id for one in kept}
         other = [one for one in current if one.id not in ids]
         beyond = sum(one.is_within is False for one in _values(other, rows, quantity)[0])
-        which = "later" if first else "earlier"
+        which = "later" if counted == "first" else "earlier"
         left_out.append(
             f"{len(other)} {which} measurements of the same serials, {beyond or 'none'} of them out of tolerance"
         )

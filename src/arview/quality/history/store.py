@@ -18,13 +18,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import sqlalchemy as sa
-from sqlalchemy.exc import (
-    DBAPIError,
-    IntegrityError,
-    NoSuchModuleError,
-    OperationalError,
-    SQLAlchemyError,
-)
+from sqlalchemy.exc import DBAPIError, IntegrityError, NoSuchModuleError, SQLAlchemyError
 
 from arview.core.extras import install_command
 from arview.errors import InputError, MissingDependencyError, OutputError
@@ -36,6 +30,7 @@ from arview.quality.history.connection import (
     default_author,
     default_station,
     file_system,
+    is_temporary,
     own_store,
     prepare_sqlite,
     store_url,
@@ -57,7 +52,6 @@ _TRIES = 6
 """Attempts after errors that may be temporary, unless another program holds a file."""
 WAIT_S = 40.0
 """Time after which it is not waited any longer for a program that holds a file."""
-_TEMPORARY = ("locked", "busy", "deadlock", "serialize", "could not connect", "server closed", "terminating connection")
 _NETWORK_FILE_SYSTEMS = ("nfs", "nfs4", "cifs", "smb3", "smbfs", "fuse.sshfs", "9p", "afs", "glusterfs", "ceph")
 _LOCK = 0x61727669
 """Number of the advisory lock of PostgreSQL that is held while tables are created."""
@@ -385,7 +379,7 @@ class HistoryStore:
         except (InputError, OutputError):
             raise
         except SQLAlchemyError as error:
-            raise _Failure(self._message(error), _is_temporary(error)) from error
+            raise _Failure(self._message(error), is_temporary(error)) from error
 
     def _retried(self, work: Callable[[], Found]) -> Found:
         """Do the work, and repeat it after temporary errors; adding a result repeatedly stores it once.
@@ -481,10 +475,6 @@ class _Failure(OutputError):
     def __init__(self, message: str, is_temporary: bool) -> None:
         super().__init__(message)
         self.is_temporary = is_temporary
-
-
-def _is_temporary(error: SQLAlchemyError) -> bool:
-    return isinstance(error, OperationalError | DBAPIError) and any(word in str(error).lower() for word in _TEMPORARY)
 
 
 def _stamp(moment: datetime) -> str:
