@@ -148,8 +148,8 @@ def series_of(
 ) -> ComponentSeries:
     """A quantity of a component, for the newest CAD model in the store, or for all with ``revisions``.
 
-    Of a serial number that was measured several times only the last measurement is ``counted``, or only the first, which
-    is what the process made before any rework, or all. Each value has the limits that held when it was measured. Those
+    Of a serial number that was measured several times only the last measurement is ``counted``, or only the first,
+    which is what the process made before any rework, or all. Each value has the limits that held then. Those
     of dx, dy, dz are ± the tolerance of the distance, which is necessary but not sufficient for the distance.
 
     Raises:
