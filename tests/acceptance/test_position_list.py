@@ -70,13 +70,15 @@ def test_a_list_with_semicolons_and_decimal_commas_is_compared(found: Inspection
     first, second, third = made.components
     assert first.difference_mm == pytest.approx([0.02, 0.0, 0.0], abs=1e-4)
     assert (first.uncertainty_mm, first.list_uncertainty_mm) == pytest.approx((0.04, 0.006), abs=1e-4)
-    # Three coordinates: the quantile of chi-squared that has the coverage of k = 2 is 2.833².
-    assert first.e_n == pytest.approx(0.02 / np.hypot(0.02, 0.003) / 2.833, rel=0.01)
-    assert second.e_n == pytest.approx(0.2 / np.hypot(0.03, 0.003) / 2.833, rel=0.01)
+    assert (first.axis, second.axis, third.axis) == ("x", "y", "y")
+    assert first.e_n == pytest.approx(0.02 / 2.0 / np.hypot(0.02, 0.003), rel=0.01)
+    assert second.e_n == pytest.approx(0.2 / 2.0 / np.hypot(0.03, 0.003), rel=0.01)
     assert (first.agrees, second.agrees, third.agrees) == (True, False, True)
     assert np.isnan(third.difference_mm[2])  # the inspection does not determine it
-    two = np.hypot(0.01 / np.hypot(0.02, 0.003), 0.02 / np.hypot(0.03, 0.003))
-    assert third.e_n == pytest.approx(two / 2.486, rel=0.01)
+    assert third.e_n_xyz[:2] == pytest.approx(
+        [0.01 / 2.0 / np.hypot(0.02, 0.003), 0.02 / 2.0 / np.hypot(0.03, 0.003)], rel=0.01
+    )
+    assert np.isnan(third.e_n_xyz[2])
     assert made.left_out == {"block_4": "is not in the list"}
 
 
@@ -87,19 +89,30 @@ def test_e_n_of_one_coordinate_is_that_of_the_standard(found: Inspection) -> Non
     assert made.e_n == pytest.approx(0.05 / np.hypot(0.04, 0.03), rel=1e-3)  # |difference| / sqrt(U² + U²)
 
 
+def test_to_know_more_coordinates_hides_no_difference(model: Model) -> None:
+    """The E_n of ISO 13528 by hand: 0.060 along x, U 0.04 and 0.03, with and without y and z in the list."""
+    ours = inspection(model, (deviation("block_1", (0.06, 0.0, 0.0), np.zeros(3)),))
+    nowhere = np.full(3, np.nan)
+    for known in ([0.0, 0.0, 0.0], [0.0, np.nan, np.nan]):
+        line = ListedComponent("block_1", nowhere, np.array(known), np.full(3, 0.03))
+        one = compare(ours, [line], "list").components[0]
+        assert one.e_n == pytest.approx(1.2, abs=1e-3)
+        assert (one.axis, one.agrees) == ("x", False)
+        assert (one.uncertainty_mm, one.list_uncertainty_mm) == pytest.approx((0.04, 0.03), rel=1e-3)
+
+
 def test_e_n_is_calibrated(model: Model) -> None:
-    """With right uncertainties E_n is at most 1 for 95.45 % of the components, for one, two or three coordinates."""
+    """With right uncertainties E_n is at most 1 for 95.45 % of the coordinates."""
     rng = np.random.default_rng(1)
     std, u_list = np.array([0.02, 0.03, 0.04]), 0.05
     nowhere = np.full(3, np.nan)
-    for axes in (1, 2, 3):
-        good = 0
-        for _ in range(800):
-            moved = [float(v) if i < axes else None for i, v in enumerate(rng.normal(0.0, std))]
-            ours = inspection(model, (deviation("block_1", (moved[0], moved[1], moved[2]), np.zeros(3)),))
-            line = ListedComponent("block_1", nowhere, rng.normal(0.0, u_list / 2.0, 3), np.full(3, u_list))
-            good += bool(compare(ours, [line], "list").components[0].agrees)
-        assert good / 800 == pytest.approx(0.9545, abs=0.025)
+    good = np.zeros(3)
+    for _ in range(800):
+        x, y, z = rng.normal(0.0, std).tolist()
+        ours = inspection(model, (deviation("block_1", (x, y, z), np.zeros(3)),))
+        line = ListedComponent("block_1", nowhere, rng.normal(0.0, u_list / 2.0, 3), np.full(3, u_list))
+        good += compare(ours, [line], "list").components[0].e_n_xyz <= 1.0
+    assert good / 800 == pytest.approx([0.9545] * 3, abs=0.025)
 
 
 def test_what_cannot_be_compared_is_named(model: Model, found: Inspection) -> None:
@@ -135,6 +148,9 @@ def test_what_cannot_be_compared_is_named(model: Model, found: Inspection) -> No
         ("name,dx,dy,dz,U\nblock_1,1,2,3,-1\n", "U = -1: expected a number that is not negative"),
         ("name,dx,dy,dz,dx\nblock_1,1,2,3,4\n", "the column 'dx' is there twice"),
         ("name,dx,dy,dz\n", "lists no component"),
+        ("name,dx,dy,dz,U\na,0,012,-0,008,0,003,0,004\n", "line 2 has 9 fields, the header 5 columns; separate"),
+        ("name,dx,dy,dz,U,a,b,c,d\na,0,012,-0,008,0,003,0,004\n", "line 2: dy = '012' begins with 0"),
+        ("name;dx;dy;dz\na;1;2;3;4\n", "line 2 has 5 fields, the header 4 columns"),
         (";;\n" * 80, "no line names the columns"),
     ],
 )
@@ -156,6 +172,41 @@ def test_names_of_columns(tmp_path: Path) -> None:
     assert np.isnan(one.displacement[2])
     assert np.isnan(one.place).all()
     assert one.uncertainty == pytest.approx([0.02] * 3)
+
+
+@pytest.mark.parametrize(
+    ("columns", "u"),
+    [
+        ("U", 0.002),
+        ("u", 0.004),
+        ("u [mm]", 0.004),
+        ("u_c (mm)", 0.004),
+        ("Std", 0.004),
+        ("standard uncertainty", 0.004),
+        ("Standardunsicherheit", 0.004),
+        ("Messunsicherheit [mm]", 0.002),
+        ("U (k=2) [mm]", 0.002),
+        ("U (k=3)", 0.004 / 3.0),
+        ("U_mm", 0.002),
+        ("u_mm", 0.004),
+    ],
+)
+def test_a_small_u_is_the_standard_uncertainty(columns: str, u: float, tmp_path: Path) -> None:
+    path = tmp_path / "list.csv"
+    path.write_text(f"name,dx,dy,dz,{columns}\na,0.01,0,0,0.002\n\nb,0.01,0,0,0.002,,\n", encoding="utf-8")
+    assert [one.uncertainty for one in read_position_list(path)] == [pytest.approx([u] * 3)] * 2
+    path.write_text("name,dx,ux,dy,u y,dz,UZ\na,0.01,0.002,0,0.002,0,0.002\n", encoding="utf-8")
+    assert read_position_list(path)[0].uncertainty == pytest.approx([0.004, 0.004, 0.002])
+
+
+@pytest.mark.parametrize(("column", "u"), [("U_mm", 0.02), ("U", 0.02), ("u_mm", 0.04), ("u", 0.04)])
+def test_lengths_and_points_know_a_small_u(column: str, u: float, tmp_path: Path) -> None:
+    points, lengths = tmp_path / "points.csv", tmp_path / "lengths.csv"
+    points.write_text(f"name,x,y,z,{column}\nA,0,0,0,0.02\nB,100,0,0,0.02\n")
+    lengths.write_text(f"from,to,mm,{column}\nA,B,100,0.02\n")
+    measured = read_measured(points)
+    assert measured.marks["A"].covariance == pytest.approx(np.eye(3) * (u / 2.0) ** 2)
+    assert read_known(lengths, measured)[0].uncertainty_mm == pytest.approx(u)
 
 
 def test_lengths_with_semicolons_and_decimal_commas(found: Inspection, tmp_path: Path) -> None:

@@ -14,10 +14,12 @@ from arview.cad.part import ComponentSettings, Datum
 from arview.cli import ExitCode, main
 from arview.errors import InputError
 from arview.geometry import Array, apply, exp_so3, invert, rigid
-from arview.inspection import Inspection, load_inspection
+from arview.inspection import DistanceReport, Inspection, load_inspection
+from arview.inspection.details import DistanceStatistics
 from arview.measurement.cloud import global_registration, pair_registration
 from arview.measurement.cloud.global_registration import find_model_in_cloud
 from arview.measurement.cloud.mesh_surface import MeshSurface
+from arview.measurement.cloud_report import scatter_doubts
 from arview.measurement.datums.in_cloud import measure_datums_in_cloud
 from arview.measurement.folder import in_model_frame, read_cloud
 from arview.measurement.run import measure
@@ -170,6 +172,15 @@ def test_a_scan_alone_against_truth(inspected: tuple[Inspection, Path, str, int]
 
 
 @pytest.mark.slow
+def test_a_cloud_without_scatter_is_doubted() -> None:
+    """Points taken from a CAD lie on it but for rounding; the least scatter of a scanner is far larger."""
+    for sigma_mm, is_doubted in ((0.0002, True), (0.004, False)):
+        rows = [("all", 0.3), ("base", sigma_mm), ("a", sigma_mm), ("b", 0.2)]
+        statistics = tuple(DistanceStatistics(name, 900, 0.0, one, 0.0, one) for name, one in rows)
+        doubts = scatter_doubts(DistanceReport(2.0, statistics), 150.0)
+        assert ["no scatter beside the CAD" in one for one in doubts] == [True] * is_doubted
+
+
 def test_foreign_object_and_distance_map(inspected: tuple[Inspection, Path, str, int]) -> None:
     inspection, folder, output, _ = inspected
     assert len(inspection.foreign_objects) == 1

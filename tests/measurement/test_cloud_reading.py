@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 
 from arview.errors import InputError
 from arview.geometry import Array
@@ -63,6 +65,46 @@ def test_text_with_any_separator(tmp_path: Path) -> None:
     check(tmp_path / "i.asc", "//X Y Z Nx Ny Nz\n" + rows_of(np.column_stack([POINTS, NORMALS])), True)
 
 
+@pytest.mark.parametrize(
+    "header",
+    [
+        "NomX,NomY,NomZ,ActX,ActY,ActZ",
+        "Soll X;Soll Y;Soll Z;Ist X;Ist Y;Ist Z",
+        "x_ref x_meas y_ref y_meas z_ref z_meas",
+        "x_nominal\ty_nominal\tz_nominal\tx\ty\tz",
+        "X,Y,Z,X measured,Y measured,Z measured",
+        "X Nennwert [mm];Y Nennwert [mm];Z Nennwert [mm];X Messwert [mm];Y Messwert [mm];Z Messwert [mm]"
+        "\nmm;mm;mm;mm;mm;mm",
+    ],
+)
+def test_the_measured_columns_are_taken_by_name(header: str, tmp_path: Path) -> None:
+    nominal = POINTS + np.random.default_rng(2).normal(0.0, 0.1, POINTS.shape)
+    columns = np.column_stack([nominal, POINTS])
+    columns = columns[:, [0, 3, 1, 4, 2, 5]] if "x_ref x_meas" in header else columns
+    separator = next((mark for mark in ",;\t" if mark in header), " ")
+    check(tmp_path / "a.csv", header + "\n" + rows_of(columns, separator))
+
+
+@pytest.mark.parametrize(
+    ("header", "says"),
+    [
+        ("", r"columns 1 to 3 and 4 to 6 both hold the places of points; name the measured columns ActX"),
+        ("a,b,c,d,e,f\n", r"columns 1 to 3 and 4 to 6 both hold the places"),
+        ("X1,Y1,Z1,X2,Y2,Z2\n", r"several places for each point \(x1, y1, z1, x2, y2, z2\); name the measured"),
+        ("Xn,Yn,Zn,Xa,Ya,Za\n", r"several places for each point"),
+        ("X,Y,Z,X,Y,Z\n", r"the column 'x' is there twice; name the measured"),
+        ("NomX,NomY,NomZ,DevX,DevY,DevZ\n", r"only the nominal places nomx, nomy, nomz are named"),
+        ("IstX,IstY,IstZ,ActX,ActY,ActZ\n", r"several places for each point"),
+    ],
+)
+def test_which_columns_are_measured_is_asked(header: str, says: str, tmp_path: Path) -> None:
+    nominal = POINTS + np.random.default_rng(2).normal(0.0, 0.1, POINTS.shape)
+    (tmp_path / "a.csv").write_text(header + rows_of(np.column_stack([nominal, POINTS]), ","))
+    with pytest.raises(InputError, match=says) as caught:
+        read_points(tmp_path / "a.csv")
+    assert str(caught.value).startswith(str(tmp_path / "a.csv")) and "\n" not in str(caught.value)
+
+
 def test_a_block_may_end_inside_a_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("arview.measurement.cloud.reading.text.BLOCK_BYTES", 1000)
     (tmp_path / "a.xyz").write_text(rows_of(POINTS))
@@ -94,6 +136,77 @@ def test_ply_and_pcd(tmp_path: Path) -> None:
     check(tmp_path / "b.ply", ply(">", "binary_big_endian", columns=both), True)
     check(tmp_path / "c.ply", ply(kind="ascii", columns=both), True)
     check(tmp_path / "d.pcd", pcd())
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".stl", ".obj"])
+@pytest.mark.parametrize("scale", [1.0, 0.001])
+def test_faces_of_a_mesh_are_sampled(suffix: str, scale: float, tmp_path: Path) -> None:
+    """A box of 80 × 60 × 10 mm has eight vertices; its faces are covered evenly, whatever its unit."""
+    mesh = trimesh.creation.box((80.0 * scale, 60.0 * scale, 10.0 * scale))
+    mesh.export(tmp_path / f"a{suffix}")
+    raw = read_points(tmp_path / f"a{suffix}")
+    points = (raw.points + raw.origin) / scale
+    assert len(points) > 100_000
+    beyond = np.abs(points) - [40.0, 30.0, 5.0]
+    assert np.abs(beyond.max(axis=1)).max() < 1e-3  # every point is on a face
+    top = np.count_nonzero(beyond[:, 2] > -1e-3) / len(points)
+    assert top == pytest.approx(2 * 80 * 60 / (2 * (80 * 60 + 80 * 10 + 60 * 10)), abs=0.01)
+    assert raw.normals is not None
+    assert np.sum(raw.normals * points, axis=1).min() > 4.0  # outwards
+    assert any("faces of the mesh were sampled" in note for note in raw.notes)
+
+
+def test_damaged_meshes_are_refused(tmp_path: Path) -> None:
+    mesh = trimesh.creation.icosphere(3, 20.0)
+    for suffix in (".ply", ".stl"):
+        mesh.export(tmp_path / f"a{suffix}")
+        content = (tmp_path / f"a{suffix}").read_bytes()
+        (tmp_path / f"b{suffix}").write_bytes(content[: len(content) // 2 + 7])
+        with pytest.raises(InputError, match=r"truncated") as caught:
+            read_points(tmp_path / f"b{suffix}")
+        assert "\n" not in str(caught.value)
+
+
+def ptx(stations: int = 2, per_scan: int = 600) -> str:
+    """Half of the points each from its own station, in metres, with rays that did not return."""
+    text = ""
+    for index, seen in enumerate(np.array_split(POINTS / 1000.0, stations)):
+        turn = trimesh.transformations.rotation_matrix(0.4 + index, (0.2, 0.3, 1.0))
+        turn[:3, 3] = (1.0, -2.0, 0.5 * index)
+        own = (seen - turn[:3, 3]) @ turn[:3, :3]
+        own = np.vstack([own, np.zeros((per_scan - len(own), 3))])
+        text += f"{per_scan // 10}\n10\n" + rows_of(turn[None, :3, 3]) + rows_of(turn[:3, :3].T) + rows_of(turn.T)
+        text += rows_of(np.column_stack([own, np.full(per_scan, 0.5)]))
+    return text
+
+
+def test_stations_of_a_ptx_are_brought_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for lines in (1_000_000, 7):
+        monkeypatch.setattr("arview.measurement.cloud.reading.ptx.CHUNK_LINES", lines)
+        (tmp_path / "a.ptx").write_text(ptx())
+        raw = read_points(tmp_path / "a.ptx")
+        assert (raw.points + raw.origin) * 1000.0 == pytest.approx(POINTS, abs=5e-3)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda lines: lines[:-300], "scan 2 is truncated: its header names 600 points"),
+        (lambda lines: ["99999", "99999", *lines[2:]], "holds 9999800001 points; at most"),
+        (lambda lines: ["9999", "999", *lines[2:]], "scan 1 is truncated"),
+        (lambda lines: ["sixty", *lines[1:]], "'sixty' is no number of columns or rows"),
+        (lambda lines: [*lines[:6], "2 0 0 0", *lines[7:]], "its matrix is no rigid motion"),
+        (lambda lines: [*lines[:6], *lines[7:]], "its matrix is no rigid motion"),
+        (lambda lines: [*lines[:3], *lines[4:]], "its header is damaged"),
+        (lambda lines: [*lines[:20], "1.0 scanner 2", *lines[21:]], "a line of points is damaged"),
+        (lambda lines: [*lines[:20], "1.0", *lines[21:]], "a line of points is damaged"),
+    ],
+)
+def test_damaged_ptx_is_refused(change: Callable[[list[str]], list[str]], says: str, tmp_path: Path) -> None:
+    (tmp_path / "a.ptx").write_text("\n".join(change(ptx().splitlines())))
+    with pytest.raises(InputError, match=says) as caught:
+        read_points(tmp_path / "a.ptx")
+    assert str(caught.value).startswith(str(tmp_path / "a.ptx")) and "\n" not in str(caught.value)
 
 
 def test_las_laz_and_e57(tmp_path: Path) -> None:
@@ -142,7 +255,7 @@ def test_las_laz_and_e57(tmp_path: Path) -> None:
         ("i.xyz", b"a" * 100_000, "no line with three numbers"),
         ("j.xyz", b"1 2 3\n" + b"7" * 90_000, "a line of more than"),
         ("k.csv", b"a,b\n" + b"1,2\n" * 40, "no line with three numbers"),
-        ("l.stl", b"solid", "is no known format"),
+        ("l.step", b"solid", "is no known format"),
         ("m.xyz", b"\0\1\2\3" * 50, "is not a text file"),
     ],
 )

@@ -1,9 +1,8 @@
 """An inspection beside the list of another measurement, such as that of a coordinate measuring machine: E_n numbers.
 
-The E_n number (ISO/IEC 17043, ISO 13528) of a scalar is the difference of two results over the root of the sum of their
-squared U. Here a component has up to three coordinates with one covariance: the squared difference in the metric of the
-summed covariances, over the quantile of chi-squared that has the coverage of k = 2, which is E_n itself for one
-coordinate. Up to 1 the results agree within their stated uncertainties.
+The E_n number (ISO/IEC 17043, ISO 13528) of a coordinate is the difference of two results over the root of the sum of
+their squared U. Up to 1 the results agree within their stated uncertainties. A component has one for each coordinate
+that both determine, and the largest decides, so that a coordinate more never hides a difference in another.
 """
 
 from __future__ import annotations
@@ -21,8 +20,8 @@ from arview.errors import InputError
 from arview.geometry import Array
 from arview.inspection import ComponentDeviation, Finding, Inspection
 
-_COVERAGE = 0.9545
-"""Coverage of U with k = 2 for a normally distributed error."""
+_MIN_U_MM = 1e-9
+"""A smaller U of both together is none: E_n would be without bound."""
 
 
 @dataclass(frozen=True)
@@ -33,17 +32,24 @@ class ComparedComponent:
         name: of the component.
         difference_mm: (3,) displacement of the inspection minus that of the list, NaN where one of them has none.
         distance_mm: length of the difference over the axes that both have.
-        uncertainty_mm: expanded uncertainty (k = 2) of the inspection along the difference.
+        e_n_xyz: (3,) E_n number of each coordinate, NaN where there is no difference or no uncertainty.
+        axis: x, y or z, the coordinate with the largest E_n, or with the largest difference where there is none.
+        uncertainty_mm: expanded uncertainty (k = 2) of the inspection along the axis.
         list_uncertainty_mm: that of the list; None when the list does not state it.
-        e_n: E_n number; None when neither measurement states an uncertainty.
     """
 
     name: str
     difference_mm: Array
     distance_mm: float
+    e_n_xyz: Array
+    axis: str
     uncertainty_mm: float
     list_uncertainty_mm: float | None
-    e_n: float | None
+
+    @property
+    def e_n(self) -> float | None:
+        """The largest E_n number of a coordinate; None when neither measurement states an uncertainty."""
+        return None if np.isnan(self.e_n_xyz).all() else float(np.nanmax(self.e_n_xyz))
 
     @property
     def agrees(self) -> bool | None:
@@ -118,9 +124,11 @@ def comparison_record(comparison: Comparison) -> dict[str, Any]:
                 "name": one.name,
                 "difference_mm": [None if np.isnan(value) else float(value) for value in one.difference_mm],
                 "distance_mm": one.distance_mm,
+                "axis": one.axis,
                 "uncertainty_mm": one.uncertainty_mm,
                 "list_uncertainty_mm": one.list_uncertainty_mm,
                 "E_n": one.e_n,
+                "E_n_xyz": [None if np.isnan(value) else float(value) for value in one.e_n_xyz],
             }
             for one in comparison.components
         ],
@@ -143,21 +151,19 @@ def _compare(one: ComponentDeviation, line: ListedComponent, center: Array | Non
     axes = np.flatnonzero(~np.isnan(difference))
     if not len(axes):
         return "was not measured" if np.isnan(ours).all() else "has no coordinate that both measurements determine"
-    known = difference[axes]
-    distance = float(np.linalg.norm(known))
-    along = known / distance if distance > 0.0 else np.full(len(axes), len(axes) ** -0.5)
-    covariance = _covariance(one)[np.ix_(axes, axes)]
-    of_list = None
-    if line.uncertainty is not None and not np.isnan(line.uncertainty[axes]).any():
-        of_list = np.diag((line.uncertainty[axes] / K) ** 2)
-    total = covariance if of_list is None else covariance + of_list
+    ours_u = K * np.sqrt(np.diag(_covariance(one)))
+    theirs_u = np.full(3, np.nan) if line.uncertainty is None else line.uncertainty
+    total = np.hypot(ours_u, np.nan_to_num(theirs_u))
+    e_n = np.abs(difference) / np.where(total > _MIN_U_MM, total, np.nan)
+    axis = int(np.nanargmax(np.abs(difference) if np.isnan(e_n).all() else e_n))
     return ComparedComponent(
         one.name,
         difference,
-        distance,
-        K * float(np.sqrt(along @ covariance @ along)),
-        None if of_list is None else K * float(np.sqrt(along @ of_list @ along)),
-        _e_n(known, total),
+        float(np.linalg.norm(difference[axes])),
+        e_n,
+        "xyz"[axis],
+        float(ours_u[axis]),
+        None if np.isnan(theirs_u[axis]) else float(theirs_u[axis]),
     )
 
 
@@ -178,13 +184,3 @@ def _covariance(one: ComponentDeviation) -> Array:
     if one.details is not None and one.details.covariance is not None:
         return np.array(one.details.covariance)[3:, 3:]
     return np.eye(3) * ((one.uncertainty_mm or 0.0) / K) ** 2
-
-
-def _e_n(difference: Array, covariance: Array) -> float | None:
-    from scipy import stats
-
-    values, vectors = np.linalg.eigh(covariance)
-    if values.min() <= 1e-18:
-        return None
-    squared = float((((vectors.T @ difference) ** 2) / values).sum())
-    return float(np.sqrt(squared / stats.chi2.ppf(_COVERAGE, len(difference))))

@@ -69,6 +69,8 @@ class KnownLength:
 def read_measured(path: str | Path) -> MeasuredMarks:
     """Read measured positions from an ``inspection.json``, or a CSV file with columns name, x, y, z, optionally U_mm.
 
+    A column u_mm holds the standard uncertainty instead (k = 1).
+
     Raises:
         InputError: the file cannot be read, is of another kind, or has fewer than two measured positions.
     """
@@ -100,7 +102,12 @@ def read_known(path: str | Path, measured: MeasuredMarks) -> list[KnownLength]:
         lengths = _of_truth(path, text, measured)
     elif path.suffix.lower() == ".csv":
         lengths = [
-            _length(f"{path}: line {number}", (row.get("from"), row.get("to")), row.get("mm"), row.get("U_mm"))
+            _length(
+                f"{path}: line {number}",
+                (row.get("from"), row.get("to")),
+                row.get("mm"),
+                _expanded(f"{path}: line {number}", row),
+            )
             for number, row in _rows(path, text, ("from", "to", "mm"))
         ]
     else:
@@ -176,7 +183,7 @@ def _of_points(path: Path, text: str) -> MeasuredMarks:
         if not name or name in marks:
             raise InputError(f"{where}: the name {name!r} is {'not unique' if name else 'empty'}")
         place = np.array([_number(where, row[key], key) for key in "xyz"])
-        u = row.get("U_mm")
+        u = _expanded(where, row)
         std = None if u in (None, "") else _number(where, u, "U_mm", minimum=0.0) / K
         marks[name] = Mark(place, None if std is None else std**2 * np.eye(3))
     return MeasuredMarks(str(path), marks, {}, 0.0, {})
@@ -269,6 +276,15 @@ def _rows(path: Path, text: str, needed: Sequence[str]) -> list[tuple[int, Mappi
             f"{path}: the column {missing!r} is missing; the first line must contain the column names"
         ) from None
     return [(line, {name: table.plain(cell) for name, cell in row.items()}) for line, row in table.rows]
+
+
+def _expanded(where: str, row: Mapping[str, Any]) -> Any:
+    """The cell of U_mm or U (k = 2), or K times that of u_mm or u, which GUM writes for the standard uncertainty."""
+    known = {name: row[name] for name in ("U_mm", "U", "u_mm", "u") if row.get(name) not in (None, "")}
+    if not known:
+        return None
+    name, cell = next(iter(known.items()))
+    return cell if name.startswith("U") else K * _number(where, cell, name, minimum=0.0)
 
 
 def _number(where: str, value: Any, key: str, minimum: float = -math.inf) -> float:

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from arview.core.tables import Table, read_table
+from arview.acceptance.lengths import K
+from arview.core.tables import HeaderError, Table, read_table
 from arview.errors import InputError
 from arview.geometry import Array
 
@@ -33,6 +34,13 @@ _NAMES = frozenset(
 POINTS = ("part", "mass", "box")
 """Points of a component that a list may state: that of the part file, centre of mass, middle of the bounding box."""
 _UNITS = ("mm", "millimeter", "millimetre")
+_UNCERTAINTY = re.compile(
+    r"(?:d?([xyz]))?(?:(uc?|std|stddev|stdev|sigma|σ|standarduncertainty|standardunsicherheit)|(?:u95|(?:expanded|"
+    r"measurement)*uncertainty|(?:erweiterte)?(?:mess)?unsicherheit))(?:d?([xyz]))?"
+)
+"""Names of an uncertainty with its axis, as `_uncertainty` reads them; the second group is a standard uncertainty."""
+_FACTOR = re.compile(r"\(?\bk\s*=\s*([1-9]\d*(?:[.,]\d+)?)\)?")
+"""A coverage factor in the name of a column."""
 _EXPECTED = "name with x, y, z or dx, dy, dz, and optionally U"
 
 
@@ -59,13 +67,15 @@ def is_position_list(path: str | Path) -> bool:
     """Whether a file is such a list, by the names of its columns."""
     try:
         read_table(path, _is_header, _EXPECTED)
-    except InputError:
+    except HeaderError:
         return False
     return True
 
 
 def read_position_list(path: str | Path) -> tuple[ListedComponent, ...]:
-    """Read a list with the columns name, x, y, z (positions) or dx, dy, dz (deviations), and U or Ux, Uy, Uz (k = 2).
+    """Read a list with the columns name, x, y, z (positions) or dx, dy, dz (deviations), and U or Ux, Uy, Uz.
+
+    U is expanded (k = 2), a small u the standard uncertainty (k = 1), as GUM writes them; a stated factor goes before.
 
     The columns may have units in brackets and other common names (component, feature, actual x, deviation x, …). A
     column ``measurand`` says of which point x, y, z are the position, see `POINTS`; without it that of the part file.
@@ -77,7 +87,7 @@ def read_position_list(path: str | Path) -> tuple[ListedComponent, ...]:
     table = read_table(path, _is_header, _EXPECTED)
     columns = _columns(table.columns)
     for column in table.columns:
-        unit = re.search(r"[\[(]\s*([^\])]*?)\s*[\])]", column)
+        unit = re.search(r"[\[(]\s*([^\])]*?)\s*[\])]", _FACTOR.sub("", column))
         if column in columns.values() and unit and unit[1].lower() not in ("", *_UNITS):
             raise InputError(f"{table.path}: the column {column!r} is in {unit[1]}; expected mm")
     found: dict[str, ListedComponent] = {}
@@ -102,7 +112,9 @@ def _values(
     def number(key: str) -> float:
         column = columns.get(key)
         text = "" if column is None else cell(column)
-        return float("nan") if column is None or text in ("", "-", "?") else table.number(line, column, text)
+        if column is None or text in ("", "-", "?"):
+            return float("nan")
+        return table.number(line, column, text) * (K / (_uncertainty(column) or ("", K))[1])
 
     place = np.array([number(axis) for axis in "xyz"])
     displacement = np.array([number(f"d{axis}") for axis in "xyz"])
@@ -139,14 +151,26 @@ def _key(column: str) -> str | None:
         return "name"
     if joined == "measurand":
         return joined
-    if joined in ("u", "u95", "uncertainty", "expandeduncertainty", "unsicherheit", "messunsicherheit"):
-        return "u"
+    uncertainty = _uncertainty(column)
+    if uncertainty is not None:
+        return uncertainty[0]
     for axis in "xyz":
-        if joined in (f"u{axis}", f"{axis}u", f"uncertainty{axis}", f"{axis}uncertainty"):
-            return f"u{axis}"
         marks = ("d", "δ", "dev", "deviation", "delta", "diff", "abw", "abweichung")
         if any(joined in (mark + axis, axis + mark) for mark in marks):
             return f"d{axis}"
         if any(joined in (mark + axis, axis + mark) for mark in ("", "actual", "act", "measured", "meas", "ist")):
             return axis
     return None
+
+
+def _uncertainty(column: str) -> tuple[str, float] | None:
+    """The key of a column of uncertainties, u, ux, uy or uz, and its coverage factor k; None for another column."""
+    stated = _FACTOR.search(column)
+    text = re.sub(r"[\[(].*?[\])]", "", _FACTOR.sub("", column))
+    joined = "".join(word for word in re.split(r"[^\wäöü]+|_", text) if word.lower() not in _UNITS)
+    found = _UNCERTAINTY.fullmatch(joined.lower())
+    if found is None:
+        return None
+    is_standard = found[2] is not None and not (found[2] == "u" and "U" in joined)
+    k = float(stated[1].replace(",", ".")) if stated else 1.0 if is_standard else K
+    return f"u{found[1] or found[3] or ''}", k

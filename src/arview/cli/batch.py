@@ -82,7 +82,7 @@ def batch(
 
     jobs = quality.load_jobs(jobs_path)
     if store is not None:
-        history.HistoryStore(store).close()
+        history.HistoryStore(store, tell=say).close()
     options = quality.BatchOptions(scheduler, workers or 0, memory_limit, retries, connect_s)
     with tqdm(desc="jobs", total=len(jobs), disable=None, leave=False, unit="") as bar:
 
@@ -120,7 +120,7 @@ def _line(result: quality.JobResult) -> str:
 
 def _add(results: list[quality.JobResult], store: str, station: str | None) -> None:
     """Add the results to the store; those already there stay as they are."""
-    with history.HistoryStore(store) as opened, tempfile.TemporaryDirectory() as folder:
+    with history.HistoryStore(store, tell=say) as opened, tempfile.TemporaryDirectory() as folder:
         new = 0
         for one in results:
             content = quality.read(f"{one.out}/inspection.json") if one.inspection_sha256 else None

@@ -6,7 +6,6 @@ import json
 import zoneinfo
 from collections.abc import Callable, Sequence
 from datetime import UTC, datetime, tzinfo
-from typing import TYPE_CHECKING
 
 import click
 
@@ -17,9 +16,6 @@ from arview.core.extras import require
 from arview.errors import ArviewError, InputError
 from arview.quality import decisions
 from arview.quality import history as quality
-
-if TYPE_CHECKING:
-    pass
 
 _SHOWN_CHANGES = 8
 _QUANTITIES = ("distance", "dx", "dy", "dz", "tilt", "twist")
@@ -230,9 +226,11 @@ the mean moving range. A value beyond them, 8 in a row on one side of the mean, 
 fall are signals. Cp and Cpk (ISO 22514-2) come with 95 % confidence intervals. They are called Pp and Ppk
 when the process is not in control, refused below 10 values, and given with a warning below 50. Each value
 is judged by the limits that held when it was measured: where these changed, the date is printed, and
-there are indices for the values of each. A distance
-has an upper limit only, hence Cpk alone. Distances near zero are not normally distributed; dx, dy and dz
-describe a process better. A serial that was measured again counts once, unless --repeats is given. Only
+there are indices for the values of each. A distance has an upper limit only, hence Cpk alone. Distances
+near zero are not normally distributed: their index is by the percentiles of a distribution of lengths
+that fits, such as Rayleigh's or the folded normal; dx, dy and dz describe a process better. A serial that
+was measured again counts once, by its last measurement (--first: its first, --repeats: each); the indices
+are of the first ones, before any rework. A part without the component is not within its limits. Only
 results of the newest CAD model count, unless --revisions is given.""",
 )
 @click.option("--component", required=True, metavar="NAME", help="Component to chart.")
@@ -241,6 +239,7 @@ results of the newest CAD model count, unless --revisions is given.""",
 @click.option("--lower", type=float, metavar="X", help="Lower limit, instead of the tolerance's.")
 @click.option("--upper", type=float, metavar="X", help="Upper limit, instead of the tolerance's.")
 @ZONE
+@click.option("--first", is_flag=True, help="Count the first measurement of a serial, not the last.")
 @click.option("--repeats", is_flag=True, help="Count every measurement of a serial.")
 @click.option("--revisions", is_flag=True, help="Count results of every CAD model that has the component.")
 @click.option("-o", "--output", metavar="FILE", help="Picture to write: .svg, .png or .pdf.")
@@ -249,28 +248,37 @@ results of the newest CAD model count, unless --revisions is given.""",
 @SINCE
 @STORE
 def chart(
-    component: str, quantity: str, lower: float | None, upper: float | None, repeats: bool, revisions: bool,
-    output: str | None, zone: tzinfo, part: str | None, station: str | None, since: str | None, store: str | None,
+    component: str, quantity: str, lower: float | None, upper: float | None, first: bool, repeats: bool,
+    revisions: bool, output: str | None, zone: tzinfo, part: str | None, station: str | None, since: str | None,
+    store: str | None,
 ) -> None:  # fmt: skip
     """Show the trend of a component over the parts, with control limits, Cp and Cpk."""
     if output is not None:
         require("a figure", "matplotlib")
-
     target = None if output is None else output_path(output, [])
     if target is not None and target.suffix.lstrip(".").lower() not in quality.FORMATS:
         raise InputError(f"{target}: expected a name that ends with {', '.join('.' + one for one in quality.FORMATS)}")
+    if first and repeats:
+        raise InputError("--first and --repeats exclude each other: give one of them")
     with _open(store, must_exist=True) as opened:
-        series = quality.series_of(
-            opened, component, quantity, part, station, _moment(since, zone), repeats, revisions  # type: ignore[arg-type]
-        )  # fmt: skip
-    series = series.with_limits(lower, upper).in_zone(zone)
+
+        def series_of(counted: str) -> quality.ComponentSeries:
+            moment = _moment(since, zone)
+            found = quality.series_of(
+                opened, component, quantity, part, station, moment, counted, revisions  # type: ignore[arg-type]
+            )  # fmt: skip
+            return found.with_limits(lower, upper).in_zone(zone)
+
+        series = series_of("first" if first else "all" if repeats else "last")
+        again = series.earlier > 0 and not first
+        made = series_of("first") if again else series
     for reason in series.left_out:
         say(f"left out: {reason}{' (--revisions counts them)' if 'CAD model' in reason else ''}")
     values = [one.value for one in series.values]
     click.echo(f"{series.part}, {series.component}, {series.quantity} in {series.unit}: {_count(values)}")
     changes = series.changes()
     for sentence in changes[:_SHOWN_CHANGES]:
-        click.echo(sentence)
+        click.echo(_one_line(sentence))
     if len(changes) > _SHOWN_CHANGES:
         click.echo(f"and {len(changes) - _SHOWN_CHANGES} more changes")
     limits = None
@@ -279,15 +287,17 @@ def chart(
         _print_chart(limits, series)
     except ArviewError as error:
         say(str(error))
-    within = [one.is_within for one in series.values if one.is_within is not None]
-    if within:
-        click.echo(f"{sum(within)} of {len(within)} within the limits that held for them")
+    for one, when in ((series, ""), (made, " at their first measurement, of which the indices are"))[: 1 + again]:
+        within, counted = one.within
+        if counted:
+            absent = f"; it is missing on {len(one.missing)}" if one.missing else ""
+            click.echo(f"{within} of {counted} within the limits that held for them{when}{absent}")
     ability = None
-    found = quality.capability_by_limits(series)
-    for (low, high), one in found.items():
-        _print_capability(one, series, (low, high) if len(found) > 1 else None)
-        if isinstance(one, quality.Capability) and (low, high) == (series.lower, series.upper):
-            ability = one
+    found = quality.capability_by_limits(made)
+    for (low, high), index in found.items():
+        _print_capability(index, made, (low, high) if len(found) > 1 else None)
+        if isinstance(index, quality.Capability) and (low, high) == (series.lower, series.upper) and not again:
+            ability = index
     if target is not None:
         write_file(target, quality.draw(series, limits, ability, target.suffix.lstrip(".").lower()))
         click.echo(f"wrote {target}")
@@ -298,7 +308,8 @@ def _print_chart(limits: quality.ControlChart, series: quality.ComponentSeries) 
                f"mean moving range {limits.range_center:.4f}")  # fmt: skip
     for index, why in limits.signals.items():
         one = series.values[index]
-        click.echo(f"  {one.serial or f'no. {one.result_id}'} ({one.measured:%Y-%m-%d %H:%M}): {one.value:+.4f}, {why}")
+        name = _one_line(one.serial) or f"no. {one.result_id}"
+        click.echo(f"  {name} ({one.measured:%Y-%m-%d %H:%M}): {one.value:+.4f}, {why}")
 
 
 def _print_capability(
@@ -319,7 +330,8 @@ def _print_capability(
         low, high = ability.cp_interval
         click.echo(f"{lead}{name_cp} {ability.cp:.2f} (95 %: {low:.2f} to {high:.2f})")
     low, high = ability.cpk_interval
-    click.echo(f"{lead}{name_cpk} {ability.cpk:.2f} (95 %: {low:.2f} to {high:.2f})")
+    of = "" if ability.distribution == "normal" else f", by the percentiles of the {ability.distribution} distribution"
+    click.echo(f"{lead}{name_cpk} {ability.cpk:.2f} (95 %: {low:.2f} to {high:.2f}){of}")
     for warning in ability.warnings:
         say(f"warning: {lead}{warning}")
 
@@ -409,7 +421,6 @@ def list_decisions(
 
 
 def _print_decisions(rows: Sequence[tuple[quality.StoredResult, decisions.Decision]], zone: tzinfo) -> None:
-
     cells: list[tuple[str, ...]] = []
     for result, one in rows:
         word = decisions.decision_word(one) or one.kind
@@ -442,8 +453,7 @@ def _decided_word(state: decisions.RecordState | None) -> str:
 
 
 def _open(store: str | None, must_exist: bool = False) -> quality.HistoryStore:
-
-    return quality.HistoryStore(store or quality.default_store(), must_exist)
+    return quality.HistoryStore(store or quality.default_store(), must_exist, say)
 
 
 def _moment(text: str | None, zone: tzinfo) -> datetime | None:
@@ -458,8 +468,8 @@ def _moment(text: str | None, zone: tzinfo) -> datetime | None:
 
 
 def _about(one: quality.StoredResult) -> None:
-    click.echo(f"no. {one.id}, {one.part} {one.serial}, {one.verdict.replace('_', ' ')}")
-    click.echo(f"measured {one.measured:%Y-%m-%d %H:%M:%S} UTC at {one.station} by {one.tool}")
+    click.echo(f"no. {one.id}, {_one_line(f'{one.part} {one.serial}')}, {one.verdict.replace('_', ' ')}")
+    click.echo(f"measured {one.measured:%Y-%m-%d %H:%M:%S} UTC at {_one_line(one.station)} by {_one_line(one.tool)}")
     click.echo(f"added    {one.added:%Y-%m-%d %H:%M:%S} UTC, content {one.content_hash}")
     click.echo(f"CAD      {one.model_hash}")
     if one.void is not None:
@@ -470,8 +480,14 @@ def _number(value: float | None, sign: str, digits: int = 3) -> str:
     return "?" if value is None else format(value, f"{sign}.{digits}f")
 
 
+def _one_line(text: str) -> str:
+    """A text of a file or a user with a space for each line break and control character."""
+    return "".join(letter if letter.isprintable() else " " for letter in text)
+
+
 def _table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> None:
     """Print columns as narrow as their content allows: text to the left, numbers to the right."""
+    rows = [tuple(map(_one_line, row)) for row in rows]
     widths = [max(len(row[i]) for row in [head, *rows]) for i in range(len(head))]
     is_text = [
         i == 0 or name in ("hash", "serial") or name.startswith(("measured", "decided")) for i, name in enumerate(head)

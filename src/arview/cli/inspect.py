@@ -145,12 +145,14 @@ def inspect(
         pairs=pairs,
     )
     if store is not None:
-        history.HistoryStore(store).close()  # a store that cannot be used is reported now, not after the measurement
+        history.HistoryStore(
+            store, tell=say
+        ).close()  # a store that cannot be used is reported now, not after the measurement
     with line_bar(video is not None, photos is None, not no_pdf) as progress:
         outcome = workflow.inspect_part(job, output, progress=progress, starts_over=force)
     print_outcome(outcome)
     if store is not None:
-        with history.HistoryStore(store) as opened:
+        with history.HistoryStore(store, tell=say) as opened:
             added = opened.add(outcome.folder / "inspection.json", station)
             state = "added as" if added.is_new else "already there as"
             click.echo(f"history: {state} {added.id} in {opened.name}")

@@ -49,7 +49,7 @@ Examples:
     "--cloud",
     "cloud_path",
     metavar="FILE",
-    help="Measure a cloud instead: PLY, PCD, XYZ, PTS, CSV, LAS, E57.",
+    help="Measure a cloud instead: PLY, PCD, XYZ, PTS, PTX, CSV, LAS, E57, STL, OBJ.",
 )
 @click.option("--cloud-unit", metavar="UNIT", help="Unit of the cloud: mm, cm, m, inch, ft, um; default: by its size.")
 @click.option(

@@ -216,7 +216,9 @@ def sign(job: str, note: str, by: str, store: str | None) -> None:
         opened = None
         if store is not None:
             quality.first_inspection(job)  # an error of the job comes first
-            opened = stack.enter_context(history.HistoryStore(store))  # before a signature that cannot be taken back
+            opened = stack.enter_context(
+                history.HistoryStore(store, tell=say)
+            )  # before a signature that cannot be taken back
         quality.sign_inspection(job, by, note)
         is_released = _told_state(job)
         if opened is not None:

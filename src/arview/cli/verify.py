@@ -93,9 +93,10 @@ Examples:
 \b
 LIST is a CSV of another measurement, such as a coordinate measuring machine's: columns name and x, y, z
 (the stated point of the component) or dx, dy, dz (measured minus nominal), in the datum frame, and
-optionally U (k = 2), in mm; separated by ; or , or tabs, with decimal point or comma. INSPECTION is an
-inspection.json or the folder it is in; default: inspection.json in the folder of LIST. The E_n number
-(ISO/IEC 17043) of a component is the difference of both over their joint U: up to 1, they agree.""",
+optionally U (k = 2) or u (k = 1), in mm; separated by ; or , or tabs, with decimal point or comma.
+INSPECTION is an inspection.json or the folder it is in; default: inspection.json in the folder of LIST.
+The E_n number (ISO/IEC 17043) of a coordinate is the difference of both over their joint U: up to 1, they
+agree. A component has that of its worst coordinate, which is named, with U and U list along it.""",
     exit_codes={
         ExitCode.DONE: "every E_n is at most 1",
         ExitCode.FAIL: "an E_n is above 1",
@@ -144,13 +145,14 @@ def _compare(measured: str, known: str, target: Path | None, model: Model | None
         cells = [*one.difference_mm, one.distance_mm, one.uncertainty_mm, one.list_uncertainty_mm]
         signs = ("+", "+", "+", "", "", "")
         row = [_cell(value, f"{sign}.3f") for value, sign in zip(cells, signs, strict=True)]
-        click.echo(f"{one.name:{width}}{''.join(row)}{_cell(one.e_n, '.2f')}{'' if one.agrees else '  differs'}")
+        e_n = f"{_cell(one.e_n, '.2f')} {one.axis}"
+        click.echo(f"{one.name:{width}}{''.join(row)}{e_n}{'  differs' if one.agrees is False else ''}")
     if not shows_all and len(ranked) > _SHOWN:
         click.echo(f"… and {len(ranked) - _SHOWN} with smaller E_n (--all shows them)")
     x, y, z = found.common_shift_mm
     click.echo(f"mean difference: {x:+.3f}, {y:+.3f}, {z:+.3f} mm (a common shift points to different datum frames)")
     if any(one.list_uncertainty_mm is None for one in found.components):
-        say("note: the list states no U for some components: their E_n takes the inspection's U alone")
+        say("note: the list states no U for some coordinates: their E_n takes the inspection's U alone")
     agreeing = sum(bool(one.agrees) for one in found.components)
     click.echo(f"E_n ≤ 1 for {agreeing} of {len(found.components)} components")
     if target is not None:
@@ -198,7 +200,8 @@ def _print(test: acceptance.Verification, shows_all: bool) -> None:
         why = "simulated, since lengths share marks" if test.is_shared else "binomial"
         click.echo(
             f"U (k = 2) {test.u_held}: {test.within} of {len(test.lengths)} errors are within it, {low} to {high} are"
-            f" expected if it is right ({why}); the errors are {test.ratio:.2f} × the stated U"
+            f" expected if it is right ({why}); their rms is {test.ratio:.2f} × the"
+            " standard uncertainty (1 is expected)"
         )
     if len(test.lengths) < acceptance.FULL_TEST:
         click.echo(f"note: VDI/VDE 2634 part 1 asks for {acceptance.FULL_TEST} lengths, five on each of seven lines")

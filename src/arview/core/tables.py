@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -48,7 +49,7 @@ class Table:
         """The number in a cell.
 
         Raises:
-            InputError: the cell holds no number below 1e9.
+            InputError: the cell holds no number below 1e9, or the decimals of one that a comma cut in two.
         """
         try:
             value = float(self.plain(cell).replace("\u00a0", "").replace(" ", "")) if _is_number(cell) else math.nan
@@ -56,6 +57,11 @@ class Table:
             value = math.nan
         if not abs(value) < _MAX_NUMBER:
             raise InputError(f"{self.path}: line {line}: {column} = {cell!r}: expected a number")
+        if re.fullmatch(r"[-+\u2212]?0\d+", cell):
+            raise InputError(
+                f"{self.path}: line {line}: {column} = {cell!r} begins with 0 like the decimals after a comma;"
+                " separate the columns by ; where numbers have a decimal comma"
+            )
         return value
 
 
@@ -90,7 +96,8 @@ def read_table(path: str | Path, is_header: Callable[[Sequence[str]], bool], exp
         expected: the columns that are needed, for the message.
 
     Raises:
-        InputError: the file cannot be read, has no such header, or mixes decimal points and commas.
+        InputError: the file cannot be read, has no such header, a line with more fields than that, or mixes decimal
+            points and commas.
     """
     path = Path(path)
     text = text_of(path)
@@ -115,6 +122,12 @@ def _table(path: Path, lines: Sequence[str], header: int, delimiter: str, column
     rows: list[tuple[int, Mapping[str, str]]] = []
     try:
         for cells in reader:
+            if any(cell.strip() for cell in cells[len(columns) :]):
+                commas = "; separate the columns by ; where numbers have a decimal comma" if delimiter == "," else ""
+                raise InputError(
+                    f"{path}: line {header + 1 + reader.line_num} has {len(cells)} fields, the header {len(columns)}"
+                    f" columns{commas}"
+                )
             if any(cell.strip() for cell in cells):
                 filled = [*(cell.strip() for cell in cells), *[""] * (len(columns) - len(cells))]
                 rows.append((header + 1 + reader.line_num, dict(zip(columns, filled, strict=False))))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from datetime import datetime
+from datetime import UTC, datetime
 from typing import Any
 
 from arview.errors import InputError
@@ -59,14 +59,14 @@ def from_document(document: dict[str, Any]) -> Inspection:
 
 
 def moment(text: str) -> datetime:
-    """The time of a measurement.
+    """The time of a measurement, UTC; the text may have another offset.
 
     Raises:
         InputError: the text is not a date and time.
     """
     try:
-        return datetime.fromisoformat(text)
-    except ValueError as error:
+        return datetime.fromisoformat(text).astimezone(UTC)
+    except (ValueError, OverflowError) as error:
         raise InputError(f"created: {text!r} is not a date and time ({error})") from None
 
 

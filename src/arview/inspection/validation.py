@@ -75,6 +75,8 @@ def _is_of_component(error: Any) -> bool:
 def _message(error: Any) -> str:
     place = error.json_path.removeprefix("$").removeprefix(".") or "file"
     message = " ".join(error.message.split())
+    if place == "created" and error.validator == "pattern":
+        message = f"{error.instance!r}: expected a time with its zone, such as 2026-10-01T08:00:00Z or …T10:00:00+02:00"
     if len(message) > _MESSAGE_LIMIT:
         message = message[: _MESSAGE_LIMIT - 1] + "…"
     return f"{place}: {message}"

@@ -24,6 +24,21 @@ from arview.measurement.datums.alignment import Alignment
 from arview.measurement.plot import save_picture
 from arview.reconstruction import DenseCloud
 
+MIN_SCATTER = 1e-5
+"""Scatter of measured points about each component's surface over the diameter of the part: a thousandth of a millimetre
+at 100 mm, less than any scanner leaves, and more than the rounding of files."""
+
+
+def scatter_doubts(distances: DistanceReport, diameter_mm: float) -> list[str]:
+    """A warning where a cloud lies on the CAD without scatter, as points taken from the CAD do; else nothing."""
+    sigma_mm = float(np.median([row.sigma_mm for row in distances.statistics[1:] or distances.statistics]))
+    if sigma_mm > MIN_SCATTER * diameter_mm:
+        return []
+    return [
+        f"the cloud has no scatter beside the CAD (sigma {sigma_mm:.5f} mm): such points are nominal ones, taken from a"
+        " CAD, and not measured; check which columns or which file holds the measured points"
+    ]
+
 
 def inspect_cloud(
     cloud: DenseCloud,

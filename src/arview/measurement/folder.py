@@ -35,6 +35,8 @@ from arview.reconstruction import (
     read_model,
 )
 
+BY_SHAPE = "the part was found by the shape of the cloud alone"
+"""Warning that nothing but its shape says how the part lies in the cloud."""
 _NORMALS_WITHIN_MM = 3.0
 """Distance from the CAD within which the side of a cloud's normals is compared with the surface's."""
 _SCALE_STD = 1e-3
@@ -106,7 +108,7 @@ def read_cloud(
     """Read a cloud without photos, in any frame, with or without normals.
 
     Args:
-        path: PLY, PCD, XYZ, PTS, CSV, LAS, LAZ or E57.
+        path: a file as `measurement.cloud.reading.read_points` reads it.
         model: the CAD, by whose size the unit is found; without it the unit is mm.
         unit: of the file, see `measurement.cloud.reading.UNITS_MM`; None: as the file declares it, or by size.
         rescales: divide the cloud by the factor by which it is larger than the CAD's base.
@@ -192,7 +194,7 @@ def in_model_frame(reconstruction: MetricReconstruction, part: Part) -> MetricRe
             "cloud: lengths are in an arbitrary unit, and the part file has no two datums whose distance gives the "
             "scale; reconstruct with a board, a tag or a scale bar"
         )
-    warnings = [*scale.warnings, "the part was found by the shape of the cloud alone"]
+    warnings = [*scale.warnings, BY_SHAPE]
     if scale.scale is None:
         found = find_model_in_cloud(cloud, part.model, None)
     else:

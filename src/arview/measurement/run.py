@@ -18,7 +18,7 @@ from arview.core.progress import Progress
 from arview.errors import InputError
 from arview.geometry import Array
 from arview.inspection import DistanceReport, FailedDatum, ForeignReport, Inspection
-from arview.measurement.cloud_report import inspect_cloud
+from arview.measurement.cloud_report import inspect_cloud, scatter_doubts
 from arview.measurement.datums.alignment import Alignment, align
 from arview.measurement.datums.datum_fit import check_covered
 from arview.measurement.datums.equations import DatumEquations, move_equations
@@ -26,7 +26,8 @@ from arview.measurement.datums.in_cloud import measure_datums_in_cloud
 from arview.measurement.datums.in_photos import measure_datums_in_photos
 from arview.measurement.datums.partial import MeasureDatum, measure_each
 from arview.measurement.datums.planes import base_plane
-from arview.measurement.folder import MetricReconstruction, in_model_frame, read_folder
+from arview.measurement.folder import BY_SHAPE, MetricReconstruction, in_model_frame, read_folder
+from arview.measurement.look_alikes import with_unsure_names
 from arview.measurement.measurand import measurand_of
 from arview.measurement.options import ComponentMeasurement, MeasureOptions, combined_of
 from arview.measurement.photo import PhotoViews, load_views, measure_components_in_photos
@@ -124,11 +125,16 @@ def _measure(reconstruction: MetricReconstruction, part: Part, options: MeasureO
         record = in_partial_frame(record, failed)
         deviations.append(with_seen_from(with_hidden(record, MOSTLY_HIDDEN) if is_hidden else record, seen))
         tell("uncertainty", done, len(names))
+    if BY_SHAPE in warnings:
+        deviations, doubts = with_unsure_names(deviations, part)
+        warnings += doubts
     foreign: tuple[ForeignReport, ...] = ()
     distances: DistanceReport | None = None
     if reconstruction.cloud is not None and "cloud" in options.methods:
         tell("distance map", 0, 1)
         foreign, distances = inspect_cloud(reconstruction.cloud, part.model, alignment, deviations, options.maps_folder)
+        if views is None and distances is not None:
+            warnings += scatter_doubts(distances, part.model.diameter_mm)
         for index, name in enumerate(names):
             if is_covered(part.model.component(name).centroid_in_model.tolist(), foreign):
                 deviations[index] = with_covered(deviations[index])

@@ -20,6 +20,7 @@ import numpy as np
 import pytest
 import sqlalchemy as sa
 from click.testing import CliRunner, Result
+from scipy import stats
 
 from arview.cli import ExitCode, main
 from arview.errors import InputError, MissingDependencyError, OutputError
@@ -27,6 +28,7 @@ from arview.inspection import Inspection, load_inspection, save_inspection
 from arview.quality.history import Capability, HistoryStore, capability, capability_by_limits, control_chart, series_of
 from arview.quality.history import store as store_module
 from arview.quality.history.chart import draw
+from arview.quality.history.connection import default_station
 from arview.quality.history.tables import results
 from helpers.inspections import deviation, inspection, missing
 from helpers.photo_scene import bench
@@ -173,7 +175,7 @@ def test_insert_or_replace_replaces_nothing(store: HistoryStore, tmp_path: Path)
         )
     outside.commit()
     outside.close()
-    assert [(one.id, one.station) for one in store.listed()] == [(added.id, store_module.default_station())]
+    assert [(one.id, one.station) for one in store.listed()] == [(added.id, default_station())]
     assert store.check() == (1, [])
 
 
@@ -292,6 +294,46 @@ def test_a_writer_waits_for_another(tmp_path: Path) -> None:
     assert process.wait(timeout=60) == 0
     with HistoryStore(where) as store:
         assert len(store.listed()) == 1
+
+
+def test_a_store_that_is_held_is_said_and_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Seconds are tenths here: the writer says after one wait what it waits for, and ends after all with what to do."""
+    monkeypatch.setattr("arview.quality.history.connection.BUSY_S", 0.2)
+    monkeypatch.setattr("arview.quality.history.store.BUSY_S", 0.2)
+    monkeypatch.setattr(store_module, "WAIT_S", 1.5)
+    where, path = tmp_path / "results.sqlite", saved(tmp_path, "a", built(0, 0.1))
+    HistoryStore(where).close()
+    other = sqlite3.connect(where, isolation_level=None)
+    for begin in ("BEGIN IMMEDIATE", "BEGIN EXCLUSIVE"):
+        other.execute(begin)
+        began = time.monotonic()
+        done = run("add", path, "--store", where)
+        assert 1.5 < time.monotonic() - began < 6.0
+        assert done.exit_code != 0
+        assert "another program holds the store; waiting for it, 2 s at most" in done.output
+        assert "another program has held the store for" in done.output.splitlines()[-1]
+        assert done.output.count("another program") == 2
+        other.execute("ROLLBACK")
+    other.close()
+    assert run("add", path, "--store", where).exit_code == 0
+
+
+def test_a_store_is_made_only_in_a_folder_that_exists(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = saved(tmp_path, "a", built(0, 0.1))
+    where = tmp_path / "share" / "of" / "plate.sqlite"
+    for arguments, environment in ((["--store", where], {}), ([], {"ARVIEW_STORE": str(where)})):
+        for name, value in environment.items():
+            monkeypatch.setenv(name, value)
+        done = run("add", path, *arguments)
+        assert done.exit_code == ExitCode.BAD_INPUT, done.output
+        assert f"{where.parent}: no such folder for a store; create it, or mount the share" in done.output
+        assert not (tmp_path / "share").exists()
+    monkeypatch.delenv("ARVIEW_STORE")
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "home"))
+    first, second = run("add", path), run("add", path)
+    assert first.exit_code == second.exit_code == 0  # the user's own data folder is made
+    assert "history.sqlite: a new store is made" in first.output
+    assert "new store" not in second.output
 
 
 # ---- PostgreSQL
@@ -425,6 +467,34 @@ def test_coverage_of_the_intervals(count: int) -> None:
     assert (held / 600 < 0.985).all()
 
 
+@pytest.mark.parametrize(("freedom", "offset"), [(1, 0.0), (2, 0.0), (3, 0.0), (1, 0.25), (2, 0.25)])
+def test_the_index_of_lengths_is_by_their_percentiles(freedom: int, offset: float) -> None:
+    """Lengths of normal vectors of 0.12 mm, or 0.06 mm about an offset: ISO 22514-2 with true percentiles."""
+    rng = np.random.default_rng(freedom)
+    std = 0.06 if offset else 0.12
+    _, middle, high = std * np.sqrt(stats.ncx2.ppf([0.00135, 0.5, 0.99865], freedom, (offset / std) ** 2))
+    index = (0.5 - middle) / (high - middle)
+    found, normal, held = [], [], 0
+    for _ in range(30):
+        values = np.linalg.norm(rng.normal(0.0, std, (100, freedom)) + [offset, 0.0, 0.0][:freedom], axis=1)
+        ability = capability(values, None, 0.5, is_length=True)
+        assert ability.distribution != "normal"
+        held += ability.cpk_interval[0] < index < ability.cpk_interval[1]
+        found.append(ability.cpk)
+        normal.append(capability(values, None, 0.5).cpk)
+    assert np.median(found) == pytest.approx(index, rel=0.08)
+    assert held >= 24
+    if not offset:
+        assert np.median(normal) > 1.15 * index  # what a normal distribution would claim
+
+
+def test_lengths_far_from_zero_and_zeros() -> None:
+    values = np.random.default_rng(0).normal(2.0, 0.05, 60)
+    assert capability(values, None, 2.5, is_length=True).cpk == pytest.approx(capability(values, None, 2.5).cpk)
+    nought = capability([0.0] * 5 + [0.1, 0.2, 0.15, 0.12, 0.3], None, 0.5, is_length=True)
+    assert np.isfinite([nought.cpk, *nought.cpk_interval]).all()
+
+
 def test_errors_and_warnings() -> None:
     for values, lower, upper, message in (
         (NIST[:9], 0.0, 60.0, "need at least 10 values, there are 9"),
@@ -438,7 +508,7 @@ def test_errors_and_warnings() -> None:
     with pytest.raises(InputError, match="need at least 8 values"):
         control_chart(NIST[:7])
     skew = np.random.default_rng(0).exponential(1.0, 200)
-    assert any("not normally" in warning for warning in capability(skew, None, 9.0).warnings)
+    assert any("do not follow the normal" in warning for warning in capability(skew, None, 9.0).warnings)
     wander = np.cumsum(np.random.default_rng(0).normal(size=60))
     ability = capability(wander, -50.0, 50.0)
     assert ability.names == ("Pp", "Ppk")
@@ -468,9 +538,9 @@ def test_a_series(filled: HistoryStore, tmp_path: Path) -> None:
     assert (series.values[-1].serial, series.values[-1].value) == ("S005", 0.2)
     assert series.values[0].std == 0.01
     assert series.left_out == (
-        "1 earlier measurements of the same serials", "1 in which it was missing or not inspected",
+        "1 earlier measurements of the same serials, none of them out of tolerance", "1 in which it was missing",
     )  # fmt: skip
-    assert len(series_of(filled, "block_1", "dx", repeats=True).values) == 31
+    assert len(series_of(filled, "block_1", "dx", counted="all").values) == 31
     distance = series_of(filled, "block_1")
     assert (distance.lower, distance.upper) == (None, 0.5)
     assert series_of(filled, "block_1", "tilt").upper is None
@@ -481,6 +551,61 @@ def test_a_series(filled: HistoryStore, tmp_path: Path) -> None:
     assert len(newest.values) == 1
     with pytest.raises(InputError, match="no component 'nut'"):
         series_of(filled, "nut")
+
+
+def _reworked(store: HistoryStore, folder: Path) -> None:
+    """12 parts, every third one 0.8 mm off first (tolerance 0.5 mm) and measured again after rework."""
+    for index in range(12):
+        store.add(saved(folder, f"a{index}", built(index, 0.8 if index % 3 == 0 else 0.1 + 0.01 * (index % 4))))
+    for index in range(0, 12, 3):
+        store.add(saved(folder, f"b{index}", built(20 + index, 0.1 + 0.004 * index, serial=f"S{index:03d}")))
+
+
+def test_rework_is_told_and_the_index_is_of_the_first_measurements(store: HistoryStore, tmp_path: Path) -> None:
+    _reworked(store, tmp_path)
+    last, first = series_of(store, "block_1", "dx"), series_of(store, "block_1", "dx", counted="first")
+    assert last.left_out == ("4 earlier measurements of the same serials, 4 of them out of tolerance",)
+    assert (last.within, first.within, last.earlier) == ((12, 12), (8, 12), 4)
+    assert first.left_out == ("4 later measurements of the same serials, none of them out of tolerance",)
+    done = run("chart", "--component", "block_1", "--of", "dx", "--store", tmp_path / "results.sqlite")
+    assert done.exit_code == 0, done.output
+    assert "12 of 12 within the limits that held for them\n" in done.output
+    assert "8 of 12 within the limits that held for them at their first measurement" in done.output
+    index = capability([one.value for one in first.values], -0.5, 0.5).cpk
+    assert f"pk {index:.2f} (95 %" in done.output and index < 0.3
+    only = run("chart", "--component", "block_1", "--of", "dx", "--first", "--store", tmp_path / "results.sqlite")
+    assert "8 of 12 within" in only.output and "12 of 12" not in only.output
+    both = run("chart", "--component", "block_1", "--first", "--repeats", "--store", tmp_path / "results.sqlite")
+    assert both.exit_code == ExitCode.BAD_INPUT and "exclude each other" in both.output
+
+
+def test_a_missing_component_is_not_within_and_gives_no_index(store: HistoryStore, tmp_path: Path) -> None:
+    for index in range(12):
+        store.add(saved(tmp_path, f"{index}", built(index, 0.1 + 0.01 * (index % 4))))
+    for index in range(12, 17):
+        gone = missing("block_1", np.zeros(3))
+        store.add(saved(tmp_path, f"{index}", inspection(MODEL, (gone,), f"S{index:03d}", minutes=60 * index)))
+    other = deviation("block_2", (0.0, 0.0, 0.0), np.zeros(3))
+    store.add(saved(tmp_path, "other", inspection(MODEL, (other,), "S900", minutes=6000)))
+    series = series_of(store, "block_1")
+    assert series.left_out == ("5 in which it was missing", "1 in which it was not inspected")
+    assert (len(series.values), len(series.missing), series.within) == (12, 5, (12, 17))
+    (reason,) = capability_by_limits(series).values()
+    assert "missing on 5 of 17 parts" in str(reason)
+    done = run("chart", "--component", "block_1", "--store", tmp_path / "results.sqlite")
+    assert "12 of 17 within the limits that held for them; it is missing on 5" in done.output
+    assert "pk" not in done.output
+
+
+def test_times_with_an_offset_and_names_with_line_breaks(store: HistoryStore, tmp_path: Path) -> None:
+    document = json.loads(saved(tmp_path, "a", built(0, 0.1, serial="A\nB\x1b[31m")).read_text(encoding="utf-8"))
+    document["created"] = "2026-10-01T10:00:00+02:00"
+    (tmp_path / "a.json").write_text(json.dumps(document), encoding="utf-8")
+    store.add(tmp_path / "a.json")
+    listed = run("list", "--store", tmp_path / "results.sqlite")
+    assert "2026-10-01 08:00:00" in listed.output and "A B [31m" in listed.output
+    assert len(listed.output.splitlines()) == 3
+    assert "A B [31m" in run("show", "1", "--store", tmp_path / "results.sqlite").output
 
 
 def _rejudged(made: Inspection, tolerance_mm: float, model_hash: str | None = None) -> Inspection:

@@ -7,6 +7,7 @@ from arview.core.doors import lazy_door
 if TYPE_CHECKING:
     from arview.quality.history.chart import FORMATS as FORMATS
     from arview.quality.history.chart import draw as draw
+    from arview.quality.history.connection import default_store as default_store
     from arview.quality.history.export import to_csv as to_csv
     from arview.quality.history.export import to_json_lines as to_json_lines
     from arview.quality.history.series import ComponentSeries as ComponentSeries
@@ -21,7 +22,6 @@ if TYPE_CHECKING:
     from arview.quality.history.store import AddedResult as AddedResult
     from arview.quality.history.store import HistoryStore as HistoryStore
     from arview.quality.history.store import StoredResult as StoredResult
-    from arview.quality.history.store import default_store as default_store
 
 __getattr__, __dir__, __all__ = lazy_door(
     __name__,
@@ -30,6 +30,7 @@ __getattr__, __dir__, __all__ = lazy_door(
             "FORMATS",
             "draw",
         ),
+        "connection": ("default_store",),
         "export": (
             "to_csv",
             "to_json_lines",
@@ -51,7 +52,6 @@ __getattr__, __dir__, __all__ = lazy_door(
             "AddedResult",
             "HistoryStore",
             "StoredResult",
-            "default_store",
         ),
     },
     needs=("the results store", "sqlalchemy"),

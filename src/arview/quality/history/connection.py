@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+import getpass
+import os
+import socket
 from pathlib import Path
 from typing import Any
 
 import sqlalchemy as sa
-from sqlalchemy.exc import ArgumentError
+from sqlalchemy.exc import ArgumentError, DBAPIError, OperationalError, SQLAlchemyError
 
 from arview.errors import InputError
 
-BUSY_S = 30.0
-"""Time that a writer waits for others; a result is written in milliseconds."""
+BUSY_S = 2.0
+"""Time that a writer waits for others before it says so and tries again; a result is written in milliseconds."""
+READ_BUSY_S = 30.0
+"""Time that a reader waits, which a writer hardly ever makes it do."""
+
+_TEMPORARY = ("locked", "busy", "deadlock", "serialize", "could not connect", "server closed", "terminating connection")
+"""Words of errors after which another attempt may succeed."""
 
 
 def store_url(where: str) -> sa.URL:
@@ -37,12 +45,7 @@ def store_url(where: str) -> sa.URL:
 def prepare_sqlite(connection: Any, record: Any) -> None:
     """Settings of a new connection to SQLite: a log written ahead, on the disk before a transaction ends."""
     connection.isolation_level = None  # transactions are started below, not by the driver
-    for pragma in (
-        "journal_mode = WAL",
-        "synchronous = FULL",
-        "foreign_keys = ON",
-        f"busy_timeout = {BUSY_S * 1000:.0f}",
-    ):
+    for pragma in ("journal_mode = WAL", "synchronous = FULL", "foreign_keys = ON"):
         connection.execute(f"PRAGMA {pragma}")
 
 
@@ -50,6 +53,8 @@ def begin_sqlite(connection: sa.Connection) -> None:
     """Begin a transaction."""
     # A writer takes the lock immediately; a transaction that reads first could not wait for another writer.
     writes = connection.get_execution_options().get("arview_writes")
+    waits_s = BUSY_S if writes or connection.get_execution_options().get("arview_retries") else READ_BUSY_S
+    connection.exec_driver_sql(f"PRAGMA busy_timeout = {waits_s * 1000:.0f}")
     connection.exec_driver_sql("BEGIN IMMEDIATE" if writes else "BEGIN")
 
 
@@ -67,3 +72,33 @@ def file_system(path: Path) -> str:
         if place.is_relative_to(folder) and len(folder.parts) >= best:
             best, kind = len(folder.parts), name
     return kind
+
+
+def default_store() -> str:
+    """The store of ``ARVIEW_STORE``, else a file in the data folder of the user."""
+    return os.environ.get("ARVIEW_STORE") or str(own_store())
+
+
+def own_store() -> Path:
+    """The store in the data folder of the user, whose folders are made where they are missing."""
+    data = Path(os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share")
+    return data / "arview" / "history.sqlite"
+
+
+def default_station() -> str:
+    """The name of ``ARVIEW_STATION``, else that of this machine."""
+    return os.environ.get("ARVIEW_STATION") or socket.gethostname()
+
+
+def default_author() -> str:
+    """Who works with the store: the user's name, if it is known, and the name of this machine."""
+    try:
+        user = getpass.getuser()
+    except (KeyError, OSError, ImportError):
+        user = "unknown"
+    return f"{user}@{socket.gethostname()}"
+
+
+def is_temporary(error: SQLAlchemyError) -> bool:
+    """Whether another attempt may succeed after an error of the database."""
+    return isinstance(error, OperationalError | DBAPIError) and any(word in str(error).lower() for word in _TEMPORARY)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from datetime import datetime, tzinfo
 from itertools import pairwise
+from math import isnan, nan
 from typing import Any, Literal, get_args
 
 from arview.errors import InputError
@@ -57,8 +58,10 @@ class ComponentSeries:
     Attributes:
         part, component, quantity, unit: what was measured.
         values: the determined values.
+        missing: NaN for each part on which the component was missing, with the limits that held.
         lower, upper: the limits that hold now, those of the last value; None without a tolerance.
         left_out: descriptions of the results that are not among the values.
+        earlier: number of measurements that were left out because their serials were measured again.
     """
 
     part: str
@@ -69,16 +72,28 @@ class ComponentSeries:
     lower: float | None
     upper: float | None
     left_out: tuple[str, ...]
+    missing: tuple[SeriesValue, ...] = ()
+    earlier: int = 0
+
+    @property
+    def within(self) -> tuple[int, int]:
+        """How many parts are within the limits that held, and of how many; one without the component is not."""
+        counted = [one.is_within for one in (*self.values, *self.missing) if one.is_within is not None]
+        return sum(counted), len(counted)
 
     def with_limits(self, lower: float | None, upper: float | None) -> ComponentSeries:
         """The series with other limits for every value; None keeps those that held."""
-        values = tuple(
-            replace(one, lower=one.lower if lower is None else lower, upper=one.upper if upper is None else upper)
-            for one in self.values
-        )
+
+        def limited(values: tuple[SeriesValue, ...]) -> tuple[SeriesValue, ...]:
+            return tuple(
+                replace(one, lower=one.lower if lower is None else lower, upper=one.upper if upper is None else upper)
+                for one in values
+            )
+
         return replace(
             self,
-            values=values,
+            values=limited(self.values),
+            missing=limited(self.missing),
             lower=self.lower if lower is None else lower,
             upper=self.upper if upper is None else upper,
         )
@@ -128,14 +143,14 @@ def series_of(
     part: str | None = None,
     station: str | None = None,
     since: datetime | None = None,
-    repeats: bool = False,
+    counted: Literal["last", "first", "all"] = "last",
     revisions: bool = False,
 ) -> ComponentSeries:
     """A quantity of a component, for the newest CAD model in the store, or for all with ``revisions``.
 
-    Of a serial number that was measured several times only the last measurement counts, unless ``repeats``. Each value
-    has the limits that held when it was measured. Those of dx, dy, dz are ± the tolerance of the distance, which is
-    necessary but not sufficient for the distance.
+    Of a serial number that was measured several times only the last measurement is ``counted``, or only the first,
+    which is what the process made before any rework, or all. Each value has the limits that held then. Those
+    of dx, dy, dz are ± the tolerance of the distance, which is necessary but not sufficient for the distance.
 
     Raises:
         InputError: the store has no such results; or it has several parts and ``part`` is not given.
@@ -153,41 +168,61 @@ def series_of(
     current = found if revisions else [one for one in found if one.model_hash == found[-1].model_hash]
     if len(current) < len(found):
         left_out.append(f"{len(found) - len(current)} measured against another CAD model than the newest")
-    kept = current if repeats else _last_of_each_serial(current)
-    if len(kept) < len(current):
-        left_out.append(f"{len(current) - len(kept)} earlier measurements of the same serials")
-    rows = {row["result_id"]: row for row in store.components([one.id for one in kept], component)}
-    if not rows:
+    kept = current if counted == "all" else _one_of_each_serial(current if counted == "first" else current[::-1])
+    rows = {row["result_id"]: row for row in store.components([one.id for one in current], component)}
+    if not any(one.id in rows for one in kept):
         raise InputError(f"{store.name}: {parts[0]!r} has no component {component!r}")
-    kept, others = _of_newest_point(kept, store.details(list(rows), component), quantity)
+    if len(kept) < len(current):
+        ids = {one.id for one in kept}
+        other = [one for one in current if one.id not in ids]
+        beyond = sum(one.is_within is False for one in _values(other, rows, quantity)[0])
+        which = "later" if counted == "first" else "earlier"
+        left_out.append(
+            f"{len(other)} {which} measurements of the same serials, {beyond or 'none'} of them out of tolerance"
+        )
+    earlier = len(current) - len(kept)
+    kept, others = _of_newest_point(kept, store.details([one.id for one in kept], component), quantity)
     left_out += others
-    column = f"{quantity}_{'deg' if quantity in ('tilt', 'twist') else 'mm'}"
-    values, absent, undetermined = [], 0, 0
-    is_length = column.endswith("mm")
-    for one in kept:
+    both, not_inspected, undetermined = _values(kept, rows, quantity)
+    values, missing = ([one for one in both if isnan(one.value) is is_missing] for is_missing in (False, True))
+    for count, why in ((len(missing), "missing"), (not_inspected, "not inspected"), (undetermined, "undetermined")):
+        if count:
+            left_out.append(f"{count} in which it was {why}")
+    limits = both[-1] if both else None
+    return ComponentSeries(
+        parts[0],
+        component,
+        quantity,
+        "deg" if quantity in ("tilt", "twist") else "mm",
+        tuple(values),
+        None if limits is None else limits.lower,
+        None if limits is None else limits.upper,
+        tuple(left_out),
+        tuple(missing),
+        earlier,
+    )
+
+
+def _values(
+    listed: list[StoredResult], rows: dict[int, dict[str, Any]], quantity: Quantity
+) -> tuple[list[SeriesValue], int, int]:
+    """The values in results, NaN where the component was missing; how many did not inspect or not determine it."""
+    is_angle = quantity in ("tilt", "twist")
+    values, not_inspected, undetermined = [], 0, 0
+    for one in listed:
         row = rows.get(one.id)
-        if row is None or row["finding"] is not None:
-            absent += 1
+        value = nan if row is None or row["finding"] else row[f"{quantity}_{'deg' if is_angle else 'mm'}"]
+        not_inspected += row is None
+        undetermined += value is None
+        if row is None or value is None:
             continue
-        if row[column] is None:
-            undetermined += 1
-            continue
-        std = row["uncertainty_mm"] / 2.0 if row["uncertainty_mm"] is not None and is_length else None
-        upper = row["tolerance_mm"] if is_length else None
+        std = None if row["uncertainty_mm"] is None or is_angle else row["uncertainty_mm"] / 2.0
+        upper = None if is_angle else row["tolerance_mm"]
         lower = -upper if upper is not None and quantity in ("dx", "dy", "dz") else None
         values.append(
-            SeriesValue(
-                one.id, one.serial, one.station, one.measured, float(row[column]), std, lower, upper, one.model_hash
-            )
+            SeriesValue(one.id, one.serial, one.station, one.measured, float(value), std, lower, upper, one.model_hash)
         )
-    if absent:
-        left_out.append(f"{absent} in which it was missing or not inspected")
-    if undetermined:
-        left_out.append(f"{undetermined} in which it was undetermined")
-    lower, upper = (values[-1].lower, values[-1].upper) if values else (None, None)
-    return ComponentSeries(
-        parts[0], component, quantity, "mm" if is_length else "deg", tuple(values), lower, upper, tuple(left_out)
-    )
+    return values, not_inspected, undetermined
 
 
 def _of_newest_point(
@@ -218,6 +253,9 @@ def _stated_for(details: dict[str, Any], quantity: Quantity) -> str:
     return MEASURANDS[kind]
 
 
-def _last_of_each_serial(listed: list[StoredResult]) -> list[StoredResult]:
-    last = {one.serial: one.id for one in listed if one.serial}
-    return [one for one in listed if not one.serial or last[one.serial] == one.id]
+def _one_of_each_serial(listed: list[StoredResult]) -> list[StoredResult]:
+    """The first result listed for each serial, and all without one, in the order of their measurement."""
+    found: dict[str, StoredResult] = {}
+    for one in listed:
+        found.setdefault(one.serial or f"\0{one.id}", one)
+    return sorted(found.values(), key=lambda one: (one.measured, one.id))

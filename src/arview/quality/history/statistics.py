@@ -28,6 +28,10 @@ TREND_RUN = 6
 """Consecutive rising or falling values that are a signal."""
 NORMALITY_LEVEL = 0.01
 """Significance level of the Shapiro-Wilk test."""
+RIVAL_AIC = 2.0
+"""Distributions of lengths whose criterion of Akaike exceeds the best one's by less fit as well."""
+FAR_FROM_ZERO = 10.0
+"""Mean over standard deviation above which lengths are distributed as if they had no bound at zero."""
 MAX_MEASUREMENT_SHARE = 0.3
 """Share of the variance due to the measurement above which there is a warning."""
 
@@ -68,6 +72,7 @@ class Capability:
         lower, upper: tolerance limits; one of them may be None.
         cp, cp_interval: Cp and its two-sided 95 % confidence interval; None without both limits.
         cpk, cpk_interval: Cpk, with the nearer limit, and its two-sided 95 % confidence interval.
+        distribution: whose percentiles the indices are from.
         is_in_control: whether the process is in control; if not, the indices are Pp and Ppk.
         measurement_share: share of the variance that is due to the measurement; None when unknown.
         warnings: doubts about the indices.
@@ -85,6 +90,7 @@ class Capability:
     is_in_control: bool
     measurement_share: float | None
     warnings: tuple[str, ...]
+    distribution: str = "normal"
 
     @property
     def names(self) -> tuple[str, str]:
@@ -136,16 +142,20 @@ def capability(
     lower: float | None,
     upper: float | None,
     stds: Sequence[float | None] | None = None,
+    is_length: bool = False,
 ) -> Capability:
-    """Cp and Cpk from the sample standard deviation, with 95 % confidence intervals.
+    """Cp and Cpk by percentiles (ISO 22514-2), with 95 % confidence intervals.
 
-    The interval of Cp follows from the chi-squared distribution of the variance (exact for normal values), that of Cpk
-    from Bissell's approximation (Applied Statistics 39, 1990).
+    The limits are compared with the median and with the percentiles 0.135 % and 99.865 %, which for normal values are 3
+    sample standard deviations from the mean. Lengths are bounded by zero: theirs are of the distribution of the length
+    of a normal vector (`_length_percentiles`). The interval of Cp follows from the chi-squared distribution of the
+    variance (exact for normal values), that of Cpk from Bissell's approximation (Applied Statistics 39, 1990).
 
     Args:
         values: (N,) values.
         lower, upper: tolerance limits, of which at least one is needed.
         stds: standard uncertainties of the measurements, as far as they are known.
+        is_length: whether the values cannot be negative.
 
     Raises:
         InputError: there is no limit, there are fewer than 10 values, one is not finite, or all are equal.
@@ -161,13 +171,16 @@ def capability(
     if std < 1e-12:
         raise InputError(f"capability: all {count} values are equal")
     free = count - 1
+    (low_end, middle, high_end), scores, distribution = (mean - 3.0 * std, mean, mean + 3.0 * std), x, "normal"
+    if is_length and mean < FAR_FROM_ZERO * std:
+        (low_end, middle, high_end), scores, distribution = _length_percentiles(x, upper)
     cp = cp_interval = None
     if lower is not None and upper is not None:
-        cp = (upper - lower) / (6.0 * std)
+        cp = (upper - lower) / (high_end - low_end)
         low, high = np.sqrt(stats.chi2.ppf([0.025, 0.975], free) / free)
         cp_interval = (float(cp * low), float(cp * high))
-    sides = [(upper - mean) / (3.0 * std)] if upper is not None else []
-    sides += [(mean - lower) / (3.0 * std)] if lower is not None else []
+    sides = [(upper - middle) / (high_end - middle)] if upper is not None else []
+    sides += [(middle - lower) / (middle - low_end)] if lower is not None else []
     cpk = min(sides)
     spread = float(stats.norm.ppf(0.975)) * float(np.sqrt(1.0 / (9.0 * count) + cpk**2 / (2.0 * free)))
     warnings = []
@@ -177,9 +190,10 @@ def capability(
     chart = control_chart(x)
     if not chart.is_in_control:
         warnings.append("the process is not in control: Pp and Ppk describe the past, not the future")
-    if float(stats.shapiro(x[:5000]).pvalue) < NORMALITY_LEVEL:
+    if float(stats.shapiro(scores[:5000]).pvalue) < NORMALITY_LEVEL:
         warnings.append(
-            "the values are not normally distributed (Shapiro–Wilk, 1 %): the indices do not predict reject rates"
+            f"the values do not follow the {distribution} distribution (Shapiro–Wilk, 1 %): the indices do not predict"
+            " reject rates"
         )
     known = [one for one in stds or () if one is not None]
     share = None
@@ -200,6 +214,7 @@ def capability(
         is_in_control=chart.is_in_control,
         measurement_share=share,
         warnings=tuple(warnings),
+        distribution=distribution,
     )
 
 
@@ -212,10 +227,60 @@ def capability_by_limits(series: ComponentSeries) -> dict[tuple[float | None, fl
     for (lower, upper), values in series.by_limits().items():
         try:
             stds = [one.std for one in values]
-            found[lower, upper] = capability([one.value for one in values], lower, upper, stds)
+            absent = sum((one.lower, one.upper) == (lower, upper) for one in series.missing)
+            if absent:
+                raise InputError(
+                    f"capability: the component is missing on {absent} of {absent + len(values)} parts: an index of the"
+                    " others would look better than the process is"
+                )
+            found[lower, upper] = capability([one.value for one in values], lower, upper, stds, series.is_length)
         except InputError as error:
             found[lower, upper] = error
     return found
+
+
+def _length_percentiles(x: Array, upper: float | None) -> tuple[tuple[float, float, float], Array, str]:
+    """Percentiles 0.135, 50 and 99.865 % of lengths, their normal scores, and the name of the distribution.
+
+    The length of a vector of 1, 2 or 3 normal components of equal variance follows a noncentral chi distribution: about
+    zero the half-normal, Rayleigh and Maxwell distributions, about a common offset the folded normal and Rice's. A few
+    dozen values rarely tell these apart, so that of all that fit nearly as well as the best (Akaike 1974) the one with
+    the least favourable index counts.
+    """
+    from scipy import optimize, stats
+
+    squares = np.maximum(x, 1e-6 * x.mean()) ** 2
+
+    def misfit(freedom: int, offset: float) -> float:
+        """Negative log-likelihood; the scale follows from the mean square."""
+        scale = squares.mean() / (freedom + offset)
+        return -float(
+            np.sum(np.log(2.0 * np.sqrt(squares) / scale) + stats.ncx2.logpdf(squares / scale, freedom, offset))
+        )
+
+    fits = []
+    for freedom, central, shifted in (
+        (1, "half-normal", "folded normal"),
+        (2, "Rayleigh", "Rice"),
+        (3, "Maxwell", "noncentral Maxwell"),
+    ):
+        fits.append((2.0 + 2.0 * misfit(freedom, 0.0), freedom, 0.0, central))
+        best = optimize.minimize_scalar(
+            lambda t, f=freedom: misfit(f, float(np.exp(t))), bounds=(-4.0, 7.0), method="bounded"
+        )
+        fits.append((4.0 + 2.0 * float(best.fun), freedom, float(np.exp(best.x)), shifted))
+    least = min(fit[0] for fit in fits)
+    found = []
+    for criterion, freedom, offset, name in fits:
+        if not criterion <= least + RIVAL_AIC:
+            continue
+        scale = squares.mean() / (freedom + offset)
+        low, middle, high = np.sqrt(scale * stats.ncx2.ppf([0.00135, 0.5, 0.99865], freedom, offset)).tolist()
+        index = np.inf if upper is None else (upper - middle) / (high - middle)
+        shares = np.clip(stats.ncx2.cdf(squares / scale, freedom, offset), 1e-12, 1.0 - 1e-12)
+        found.append((index, criterion, (low, middle, high), stats.norm.ppf(shares), name))
+    _, _, percentiles, scores, name = min(found, key=lambda one: one[:2])
+    return percentiles, scores, name
 
 
 def _checked(values: ArrayLike, minimum: int, what: str) -> Array:

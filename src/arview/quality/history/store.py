@@ -6,11 +6,9 @@ by a hash of their content, so that adding one twice, or again after an interrup
 
 from __future__ import annotations
 
-import getpass
+import itertools
 import json
-import os
 import random
-import socket
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -20,25 +18,40 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import sqlalchemy as sa
-from sqlalchemy.exc import (
-    DBAPIError,
-    IntegrityError,
-    NoSuchModuleError,
-    OperationalError,
-    SQLAlchemyError,
-)
+from sqlalchemy.exc import DBAPIError, IntegrityError, NoSuchModuleError, SQLAlchemyError
 
 from arview.core.extras import install_command
 from arview.errors import InputError, MissingDependencyError, OutputError
 from arview.inspection import Inspection, content_hash, load_inspection, overall_verdict
 from arview.quality import decisions as quality
-from arview.quality.history.connection import BUSY_S, begin_sqlite, file_system, prepare_sqlite, store_url
+from arview.quality.history.connection import (
+    BUSY_S,
+    begin_sqlite,
+    default_author,
+    default_station,
+    file_system,
+    is_temporary,
+    own_store,
+    prepare_sqlite,
+    store_url,
+)
 from arview.quality.history.decided import decided_faults, decision_of_row, new_rows, stored_state
-from arview.quality.history.tables import STORE_VERSION, about, components, decisions, guards, metadata, results, voids
+from arview.quality.history.tables import (
+    STORE_VERSION,
+    about,
+    component_row,
+    components,
+    decisions,
+    guards,
+    metadata,
+    results,
+    voids,
+)
 
 _TRIES = 6
-"""Attempts after errors that may be temporary."""
-_TEMPORARY = ("locked", "busy", "deadlock", "serialize", "could not connect", "server closed", "terminating connection")
+"""Attempts after errors that may be temporary, unless another program holds a file."""
+WAIT_S = 40.0
+"""Time after which it is not waited any longer for a program that holds a file."""
 _NETWORK_FILE_SYSTEMS = ("nfs", "nfs4", "cifs", "smb3", "smbfs", "fuse.sshfs", "9p", "afs", "glusterfs", "ceph")
 _LOCK = 0x61727669
 """Number of the advisory lock of PostgreSQL that is held while tables are created."""
@@ -90,43 +103,24 @@ class StoredResult:
     void: Void | None = None
 
 
-def default_store() -> str:
-    """The store of ``ARVIEW_STORE``, else a file in the data folder of the user."""
-    named = os.environ.get("ARVIEW_STORE")
-    if named:
-        return named
-    data = Path(os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share")
-    return str(data / "arview" / "history.sqlite")
-
-
-def default_station() -> str:
-    """The name of ``ARVIEW_STATION``, else that of this machine."""
-    return os.environ.get("ARVIEW_STATION") or socket.gethostname()
-
-
-def default_author() -> str:
-    """Who works with the store: the user's name, if it is known, and the name of this machine."""
-    try:
-        user = getpass.getuser()
-    except (KeyError, OSError, ImportError):
-        user = "unknown"
-    return f"{user}@{socket.gethostname()}"
-
-
 class HistoryStore:
     """A results store, which is created if it does not exist.
 
     Args:
         where: a file (SQLite), or the URL of a PostgreSQL database: ``postgresql://user@host/database``.
         must_exist: do not create a new file.
+        tell: called with a sentence when a new store is made, and when another program holds it for seconds.
 
     Raises:
-        InputError: the file or database does not exist, is no store, or is that of a newer arview.
+        InputError: the file, its folder or the database does not exist, is no store, or is that of a newer arview.
         OutputError: the file cannot be created.
         MissingDependencyError: the driver of the database is not installed.
     """
 
-    def __init__(self, where: str | Path, must_exist: bool = False) -> None:
+    def __init__(
+        self, where: str | Path, must_exist: bool = False, tell: Callable[[str], object] = lambda text: None
+    ) -> None:
+        self._tell = tell
         url = store_url(str(where))
         self.name = url.render_as_string(hide_password=True) if url.host else str(url.database)
         self.is_sqlite = url.get_backend_name() == "sqlite"
@@ -227,7 +221,7 @@ class HistoryStore:
                 except IntegrityError:  # another station added it in the meantime (PostgreSQL)
                     number = None
                 if number is not None:
-                    rows = [_component_row(number, component) for component in inspection.components]
+                    rows = [component_row(number, component) for component in inspection.components]
                     if rows:
                         connection.execute(sa.insert(components), rows)
                     return AddedResult(int(number), row["content_hash"], True)
@@ -376,25 +370,40 @@ class HistoryStore:
     # ---- connections
 
     @contextmanager
-    def _begin(self, writes: bool = False) -> Iterator[sa.Connection]:
+    def _begin(self, writes: bool = False, retries: bool = False) -> Iterator[sa.Connection]:
         """A transaction; errors of the database become errors of arview, in one line and without passwords."""
         try:
-            with self._engine.connect().execution_options(arview_writes=writes) as connection, connection.begin():
+            options = {"arview_writes": writes, "arview_retries": retries}
+            with self._engine.connect().execution_options(**options) as connection, connection.begin():
                 yield connection
         except (InputError, OutputError):
             raise
         except SQLAlchemyError as error:
-            raise _Failure(self._message(error), _is_temporary(error)) from error
+            raise _Failure(self._message(error), is_temporary(error)) from error
 
     def _retried(self, work: Callable[[], Found]) -> Found:
-        """Do the work, and repeat it after temporary errors; adding a result repeatedly stores it once."""
-        for attempt in range(_TRIES):
+        """Do the work, and repeat it after temporary errors; adding a result repeatedly stores it once.
+
+        Raises:
+            OutputError: the error stays, or another program holds the file of the store for `WAIT_S`.
+        """
+        began, is_told = time.monotonic(), False
+        for attempt in itertools.count():
             try:
                 return work()
             except _Failure as failure:
-                if not failure.is_temporary or attempt == _TRIES - 1:
+                waited_s = time.monotonic() - began
+                if not failure.is_temporary or (attempt >= _TRIES - 1 and not self.is_sqlite):
                     raise
-                time.sleep(0.05 * 2**attempt * random.uniform(0.5, 1.5))
+                if waited_s > WAIT_S:
+                    raise OutputError(
+                        f"{self.name}: another program has held the store for {waited_s:.0f} s, and nothing was"
+                        " written: end it (a database browser, a backup, another arview), and repeat the command"
+                    ) from failure
+                if waited_s > 0.5 * BUSY_S and not is_told:
+                    is_told = True
+                    self._tell(f"{self.name}: another program holds the store; waiting for it, {WAIT_S:.0f} s at most")
+                time.sleep(0.05 * 2 ** min(attempt, 5) * random.uniform(0.5, 1.5))
         raise AssertionError("unreachable")
 
     def _make_tables(self, upgrades: bool) -> None:
@@ -416,7 +425,7 @@ class HistoryStore:
                     )
 
         def has_tables() -> bool:
-            with self._begin() as connection:
+            with self._begin(retries=True) as connection:
                 if not sa.inspect(connection).has_table(about.name):
                     return False
                 version = connection.scalar(sa.select(sa.func.max(about.c.version)))
@@ -433,10 +442,16 @@ class HistoryStore:
         if not path.exists():
             if must_exist:
                 raise InputError(f"{path}: no such store; `arview history add` creates it")
-            try:
-                path.parent.mkdir(parents=True, exist_ok=True)
-            except OSError as error:
-                raise OutputError(f"{path.parent}: cannot be created ({error.strerror or error})") from error
+            if not path.parent.is_dir():
+                if path != own_store():
+                    raise InputError(
+                        f"{path.parent}: no such folder for a store; create it, or mount the share that it is on"
+                    )
+                try:
+                    path.parent.mkdir(parents=True, exist_ok=True)
+                except OSError as error:
+                    raise OutputError(f"{path.parent}: cannot be created ({error.strerror or error})") from error
+            self._tell(f"{path}: a new store is made, there was none")
         elif path.is_dir():
             raise InputError(f"{path}: is a folder; expected the file of a store")
         kind = file_system(path)
@@ -460,20 +475,6 @@ class _Failure(OutputError):
     def __init__(self, message: str, is_temporary: bool) -> None:
         super().__init__(message)
         self.is_temporary = is_temporary
-
-
-def _is_temporary(error: SQLAlchemyError) -> bool:
-    return isinstance(error, OperationalError | DBAPIError) and any(word in str(error).lower() for word in _TEMPORARY)
-
-
-def _component_row(result_id: int, one: Any) -> dict[str, Any]:
-    dx, dy, dz = one.displacement_mm
-    return {
-        "result_id": result_id, "name": one.name, "dx_mm": dx, "dy_mm": dy, "dz_mm": dz,
-        "distance_mm": one.distance_mm, "uncertainty_mm": one.uncertainty_mm, "tolerance_mm": one.tolerance_mm,
-        "tilt_deg": one.tilt_deg, "twist_deg": one.twist_deg, "verdict": one.verdict.value,
-        "finding": None if one.finding is None else one.finding.value,
-    }  # fmt: skip
 
 
 def _stamp(moment: datetime) -> str:

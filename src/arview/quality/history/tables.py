@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from sqlalchemy import BigInteger, Column, Float, ForeignKey, Index, Integer, MetaData, String, Table, Text
 
 STORE_VERSION = 3
@@ -120,3 +122,14 @@ def _postgresql_guards(tables: tuple[str, ...]) -> list[str]:
         for table in tables
         for verb in ("UPDATE", "DELETE", "TRUNCATE")
     ]
+
+
+def component_row(result_id: int, one: Any) -> dict[str, Any]:
+    """The row of a component of a result."""
+    dx, dy, dz = one.displacement_mm
+    return {
+        "result_id": result_id, "name": one.name, "dx_mm": dx, "dy_mm": dy, "dz_mm": dz,
+        "distance_mm": one.distance_mm, "uncertainty_mm": one.uncertainty_mm, "tolerance_mm": one.tolerance_mm,
+        "tilt_deg": one.tilt_deg, "twist_deg": one.twist_deg, "verdict": one.verdict.value,
+        "finding": None if one.finding is None else one.finding.value,
+    }  # fmt: skip

@@ -1,4 +1,4 @@
-"""Reading clouds of scanners and other programs: PLY, PCD, XYZ, PTS, CSV, LAS, LAZ and E57."""
+"""Reading clouds of scanners and other programs: PLY, PCD, XYZ, PTS, PTX, CSV, LAS, LAZ, E57 and meshes."""
 
 from arview.measurement.cloud.reading.files import SUFFIXES, read_points
 from arview.measurement.cloud.reading.raw_points import RawPoints

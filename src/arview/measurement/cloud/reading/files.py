@@ -1,5 +1,7 @@
 """Reading a cloud by its format: PLY by NumPy, PCD by Open3D, LAS and LAZ by laspy, E57 by pye57, text by `text`.
 
+Meshes are read as CAD is, and their faces sampled: decimated ones have few vertices, most of them on edges.
+
 Headers are checked against the size of the file first, so that a damaged one cannot make a library allocate memory
 without end.
 """
@@ -8,14 +10,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
+from arview.cad import face_areas, load_model, sample_surface
 from arview.core.extras import load, require
 from arview.errors import ArviewError, InputError
 from arview.measurement.cloud.open3d_library import load_open3d
+from arview.measurement.cloud.reading.ptx import read_ptx
 from arview.measurement.cloud.reading.raw_points import PointCollector, RawPoints, check_count
 from arview.measurement.cloud.reading.text import BLOCK_BYTES, read_text
 
@@ -23,6 +28,8 @@ MAX_HEADER_BYTES = 65_536
 """Length of the header of a PLY or PCD file."""
 CHUNK_POINTS = 2_000_000
 """Points of a LAS file that are decoded at a time."""
+MESH_POINTS = 400_000
+"""Points at which the faces of a mesh are sampled; one with more vertices is as dense as a cloud, and taken as one."""
 
 _TYPES = {
     **{name: name for name in ("int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "uint64")},
@@ -45,7 +52,8 @@ def read_points(path: str | Path) -> RawPoints:
     """Read a cloud in its own unit.
 
     Args:
-        path: PLY, PCD, XYZ, PTS, CSV, TXT, ASC, LAS, LAZ or E57; known by its first bytes, else by its suffix.
+        path: PLY, PCD, XYZ, PTS, PTX, CSV, TXT, ASC, LAS, LAZ, E57, STL or OBJ; known by its first bytes,
+            else by its suffix.
 
     Raises:
         InputError: the file cannot be read, is of another format, is damaged, or holds no points.
@@ -70,15 +78,16 @@ def read_points(path: str | Path) -> RawPoints:
 
 
 def _read_ply(path: Path) -> RawPoints:
-    """The vertices of a PLY file, which must be its first element."""
+    """The vertices of a PLY file, which must be its first element, or samples of its faces."""
     header = _header(path, b"end_header")
-    kind, count, elements, types = "", 0, [""], {}
+    kind, count, has_faces, elements, types = "", 0, False, [""], {}
     for words in (line.split() for line in header.splitlines()):
         if words[:1] == ["format"] and len(words) > 1:
             kind = words[1]
         elif words[:1] == ["element"] and len(words) == 3:
             elements.append(words[1])
             count = _integer(path, words[2]) if words[1] == "vertex" else count
+            has_faces |= words[1] == "face" and _integer(path, words[2]) > 0
         elif words[:1] == ["property"] and elements[-1] == "vertex":
             if len(words) != 3 or words[1] not in _TYPES or words[2] in types:
                 raise InputError(f"{path}: is not a PLY file with points (property {' '.join(words[1:])!r})")
@@ -87,6 +96,8 @@ def _read_ply(path: Path) -> RawPoints:
         raise InputError(f"{path}: is not a PLY file with points")
     record = np.dtype(list(types.items())).newbyteorder(_BYTE_ORDERS[kind])
     _check_size(path, count, len(header), 2 * len(types) if kind == "ascii" else record.itemsize)
+    if has_faces and count < MESH_POINTS:
+        return _read_mesh(path)
     columns: Any = np.zeros(count, dtype=record)
     if kind != "ascii":
         columns = np.fromfile(path, dtype=record, count=count, offset=len(header))
@@ -105,6 +116,22 @@ def _read_ply(path: Path) -> RawPoints:
     collector = PointCollector(path)
     collector.add(np.stack([columns[axis] for axis in "xyz"], axis=1), normals)
     return collector.result()
+
+
+def _read_mesh(path: Path) -> RawPoints:
+    """Samples of the triangles of a mesh, evenly by area, with their normals."""
+    try:
+        model, factor = load_model(path, "mm"), 1.0
+    except InputError:  # small numbers are lengths in m
+        model, factor = load_model(path, "m"), 1e-3
+    areas = [face_areas(one.vertices_in_model, one.faces.astype(np.int64)).sum() for one in model.components]
+    spacing = float(np.sqrt(sum(areas) / MESH_POINTS))
+    collector = PointCollector(path)
+    for one in model.components:
+        samples = sample_surface(one, spacing, MESH_POINTS)
+        collector.add(factor * samples.points, samples.normals)
+    raw = collector.result()
+    return replace(raw, notes=(*raw.notes, f"the faces of the mesh were sampled at {len(raw)} points"))
 
 
 def _check_size(path: Path, count: int, header_bytes: int, least: int) -> None:
@@ -231,6 +258,8 @@ READERS: dict[str, Callable[[Path], RawPoints]] = {
     **dict.fromkeys((".xyz", ".pts", ".csv", ".txt", ".asc"), read_text),
     **dict.fromkeys((".las", ".laz"), _read_las),
     ".e57": _read_e57,
+    ".ptx": read_ptx,
+    **dict.fromkeys((".stl", ".obj"), _read_mesh),
 }
 """Readers by suffix."""
 SUFFIXES = tuple(READERS)

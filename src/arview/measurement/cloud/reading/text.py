@@ -38,6 +38,16 @@ _MAX_LINE = 4096
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?|[-+]?(nan|inf)", re.IGNORECASE)
 _UNIT = re.compile(r"[\[(]\s*(mm|cm|m|inch|in|ft)\s*[\])]", re.IGNORECASE)
 
+Triple = tuple[int, int, int]
+"""Columns of x, y and z."""
+_MEASURED = ("act", "ist", "mea", "mess", "gemess", "scan", "real")
+"""Beginnings of words that name measured places beside the axis, as in ActX or Ist Y."""
+_NOMINAL = ("nom", "soll", "nenn", "ref", "cad", "theo", "target", "design", "master")
+"""Beginnings of words that name nominal places."""
+_DIFFERENCES = ("d", "abw", "err", "res", "tol", "u", "sig", "std", "v")
+"""Beginnings of words that name differences and uncertainties, no places."""
+_ASKED = "name the measured columns ActX, ActY, ActZ in a header line, or leave the others out"
+
 
 @dataclass(frozen=True)
 class _Layout:
@@ -55,8 +65,8 @@ class _Layout:
 
     table: bytes
     columns: int
-    point: tuple[int, int, int]
-    normal: tuple[int, int, int] | None
+    point: Triple
+    normal: Triple | None
     skipped: int
     unit: str | None
     declared: int = 0
@@ -66,8 +76,8 @@ def read_text(path: Path) -> RawPoints:
     """Read the points of a text file.
 
     Raises:
-        InputError: the file cannot be read, is not text, has no columns of coordinates, too many damaged lines, or
-            fewer lines than its header names.
+        InputError: the file cannot be read, is not text, has no columns of coordinates, several of which none is said
+            to be measured, too many damaged lines, or fewer lines than its header names.
     """
     try:
         with path.open("rb") as file:
@@ -177,15 +187,17 @@ def _layout(path: Path, start: bytes) -> _Layout:
     if "\r\n" in text or "\r" not in text:
         table[13] = 32
     values = np.array([row for row in rows_of if len(row) == columns])
-    names = next((fields for fields in map(_names, reversed(header)) if len(fields) >= 3), [])
-    point, normal = _columns_by_name(names, columns) if names else ((0, 1, 2), None)
+    names = next(filter(None, (_names(line, columns) for line in reversed(header))), [])
+    point, normal = _columns_by_name(path, names, values)
     if normal is None and not names:
         normal = _columns_of_normals(values)
+    if point is None:
+        _check_one_place(path, values)
     found = next((_UNIT.search(line) for line in reversed(header) if _UNIT.search(line)), None)
     unit = None if found is None else {"in": "inch"}.get(found[1].lower(), found[1].lower())
     words = " ".join(header).split() if path.suffix.lower() == ".pts" else []
     declared = int(words[0]) if len(words) == 1 and words[0].isdecimal() else 0
-    return _Layout(bytes(table), columns, point, normal, len(header), unit, declared)
+    return _Layout(bytes(table), columns, point or (0, 1, 2), normal, len(header), unit, declared)
 
 
 def _marks(rows: list[str]) -> str:
@@ -207,21 +219,63 @@ def _numbers(line: str, marks: str) -> list[float]:
     return [float(f) for f in fields] if fields and all(_NUMBER.fullmatch(f) for f in fields) else []
 
 
-def _names(line: str) -> list[str]:
-    """Names of columns in a header line, lower case and without units."""
+def _names(line: str, columns: int) -> list[str]:
+    """Names of columns in a header line, lower case and without units; none where it holds fewer than three.
+
+    Names may have spaces where other marks part them.
+    """
     line = re.sub(r"[\[(][^\])]*[\])]", "", line.strip().lstrip("#/ "))
-    return [name.strip(" \"'").lower() for name in re.split(r"[,;\t|]|\s+", line) if name.strip(" \"'")]
+    parted = [name.strip(" \"'").lower() for name in re.split(r"[,;\t|]", line)]
+    if len(parted) != columns:
+        parted = [name.strip(" \"'").lower() for name in re.split(r"[,;\t|]|\s+", line) if name.strip(" \"'")]
+    return parted if len([name for name in parted if name not in ("", "mm", "m", "inch")]) >= 3 else []
 
 
-def _columns_by_name(names: list[str], columns: int) -> tuple[tuple[int, int, int], tuple[int, int, int] | None]:
-    """Columns of x y z and of the normal by their names."""
+def _columns_by_name(path: Path, names: list[str], values: Array) -> tuple[Triple | None, Triple | None]:
+    """Columns of the measured x y z and of the normal by their names; None where they name no such three.
 
-    def places(wanted: tuple[str, ...]) -> tuple[int, int, int] | None:
-        found = [names.index(name) for name in wanted if name in names and names.index(name) < columns]
-        return (found[0], found[1], found[2]) if len(found) == 3 else None
+    Raises:
+        InputError: there are several places for each point, or only nominal ones, and no name says which is measured.
+    """
+    sets: dict[str, list[int]] = {}
+    for index, name in enumerate(names[: values.shape[1]]):
+        found = re.fullmatch(r"([xyz])(.*)|(.*?)([xyz])", re.sub(r"[^a-zäöüß0-9]+", "", name))
+        if found is not None:
+            places = sets.setdefault((found[2] or found[3] or ""), [-1] * 3)
+            axis = "xyz".index(found[1] or found[4])
+            if places[axis] >= 0:
+                raise InputError(f"{path}: the column {name!r} is there twice; {_ASKED}")
+            places[axis] = index
+    triples = {word: (p[0], p[1], p[2]) for word, p in sets.items() if min(p) >= 0}
+    normals = [word for word in ("n", "normal") if word in triples]
+    normals = [word for word in normals if np.linalg.norm(values[:, triples[word]], axis=1).max() < 1.1]
+    normal = next((triples.pop(word) for word in normals), None)
+    nominal = [word for word in triples if word == "n" or word.startswith(_NOMINAL)]
+    chosen = [word for word in triples if word.startswith(_MEASURED)] or [word for word in triples if word == ""]
+    if not chosen:
+        chosen = [word for word in triples if word not in nominal and not word.startswith(_DIFFERENCES)]
+    if len(chosen) > 1 or (nominal and chosen and not (chosen[0].startswith(_MEASURED) or chosen == [""])):
+        words = ", ".join(names[index] for word in triples for index in triples[word])
+        raise InputError(f"{path}: has several places for each point ({words}); {_ASKED}")
+    if nominal and not chosen:
+        words = ", ".join(names[index] for index in triples[nominal[0]])
+        raise InputError(f"{path}: only the nominal places {words} are named; {_ASKED}")
+    return (triples[chosen[0]] if chosen else None), normal
 
-    point = places(("x", "y", "z")) or places(("//x", "y", "z")) or (0, 1, 2)
-    return point, places(("nx", "ny", "nz")) or places(("normal_x", "normal_y", "normal_z"))
+
+def _check_one_place(path: Path, values: Array) -> None:
+    """Raise InputError where unnamed columns hold each point twice, as nominal beside measured places do."""
+    for first in range(values.shape[1] - 5):
+        one = values[:, first : first + 3]
+        size = float(np.sqrt(np.mean((one - one.mean(axis=0)) ** 2)))
+        for second in range(first + 3, values.shape[1] - 2):
+            apart = values[:, second : second + 3] - one
+            scatter = float(np.sqrt(np.mean((apart - apart.mean(axis=0)) ** 2)))
+            if len(values) > 3 and scatter < 0.2 * size and np.abs(apart.mean(axis=0)).max() < size:
+                raise InputError(
+                    f"{path}: columns {first + 1} to {first + 3} and {second + 1} to {second + 3} both hold the places"
+                    f" of points; {_ASKED}"
+                )
 
 
 def _columns_of_normals(values: NDArray[np.float64]) -> tuple[int, int, int] | None:
