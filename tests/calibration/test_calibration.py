@@ -18,7 +18,7 @@ from arview.calibration.board_view import BoardView
 from arview.calibration.choose import ChoiceOptions, choose_views
 from arview.calibration.plot import draw
 from arview.calibration.run import calibrate, record_of
-from arview.calibration.solve import Solution, picture_grid, pixel_difference, pixel_uncertainty, solve
+from arview.calibration.solve import Solution, picture_grid, pixel_uncertainty, solve
 from arview.calibration.verdict import Grade, assess
 from arview.calibration.views import BoardFinder
 from arview.camera import Camera
@@ -38,6 +38,7 @@ from arview.fiducials.board import Board, cv_board, parse_board, spec_of
 from arview.geometry import Array
 from arview.reconstruction.intake.lenses import Lens, lenses_of
 from helpers.board_scene import BOARD, LENS, photograph, pose
+from helpers.lens_difference import pixel_difference
 from helpers.video_files import write_clip
 
 SPEC = spec_of(BOARD)

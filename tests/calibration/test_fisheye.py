@@ -14,7 +14,7 @@ from arview.calibration.board_view import BoardView
 from arview.calibration.lens_comparison import compare_lenses
 from arview.calibration.projection import CalibratedLens, fisheye_camera, intrinsics_of, project
 from arview.calibration.run import calibrate
-from arview.calibration.solve import picture_grid, pixel_difference, pixel_uncertainty, seen_by_lens, solve
+from arview.calibration.solve import picture_grid, pixel_uncertainty, seen_by_lens, solve
 from arview.calibration.verdict import Grade, assess
 from arview.camera import Camera
 from arview.camera.lens import LensDistortion, LensModel
@@ -25,6 +25,7 @@ from arview.errors import InputError
 from arview.fiducials.board import cv_board, spec_of
 from arview.geometry import Array, exp_so3, rigid
 from helpers.board_scene import BOARD, LENS, photograph, pose, wide_pose
+from helpers.lens_difference import pixel_difference
 
 FISHEYE = Camera(
     960, 720, 315.0, 316.0, 483.0, 352.5, lens=LensDistortion(LensModel.FISHEYE, (-0.021, 0.0061, -0.0034, 0.0007))

@@ -12,7 +12,7 @@ from click.testing import CliRunner
 from arview.calibration.board_view import BoardView
 from arview.calibration.plain_boards import PlainBoardFinder, points_of, with_centres
 from arview.calibration.run import calibrate, record_of
-from arview.calibration.solve import Solution, picture_grid, pixel_difference, pixel_uncertainty, solve
+from arview.calibration.solve import Solution, picture_grid, pixel_uncertainty, solve
 from arview.camera import Camera
 from arview.camera.read import load_camera
 from arview.cli import ExitCode, main
@@ -20,6 +20,7 @@ from arview.errors import InputError
 from arview.fiducials.board import Board, parse_board, spec_of
 from arview.geometry import Array, apply
 from helpers.board_scene import BOARD, LENS, circle_radius_mm, photograph, pose
+from helpers.lens_difference import pixel_difference
 
 CHECKERBOARD = parse_board("checkerboard:9x6:24")
 CIRCLES = parse_board("circles:9x7:24")

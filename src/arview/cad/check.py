@@ -93,11 +93,6 @@ class PartCheck:
     symmetries: tuple[FoundSymmetry, ...]
     findings: tuple[PartFinding, ...]
 
-    @property
-    def has_problems(self) -> bool:
-        """True when a finding is a problem."""
-        return any(finding.severity == "problem" for finding in self.findings)
-
     def with_findings(self, findings: list[PartFinding]) -> PartCheck:
         """The report with further findings, such as those of guide views, sorted in."""
         return replace(self, findings=_sorted([*self.findings, *findings]))

@@ -154,13 +154,6 @@ def seen_by_lens(camera: Camera, rays: Array) -> NDArray[np.bool_]:
         return np.asarray(np.hypot(rays[:, 0], rays[:, 1]) <= slope)
 
 
-def pixel_difference(camera: Camera, other: Camera, pixels: Array) -> Array:
-    """(N,2) px from where ``camera`` sees rays to where ``other`` does, at pixels (N,2), less the best rotation."""
-    rays = camera.unproject(pixels)
-    _, _, pose = project(rays, camera, np.eye(4))
-    return without_span(pose[:, :3], (other.project(rays) - pixels).ravel()).reshape(-1, 2)
-
-
 def picture_grid(width: int, height: int, columns: int = 9, rows: int = 7) -> Array:
     """(columns·rows,2) pixels from corner to corner of the picture, row by row."""
     u, v = np.meshgrid(np.linspace(0, width - 1, columns), np.linspace(0, height - 1, rows))
