@@ -13,7 +13,7 @@ from arview.geometry import Array
 from arview.pose import Pose, TrackingState
 from arview.refinement import PartView
 from arview.tracking.self_calibration.estimator import pose_seen_by
-from arview.tracking.self_calibration.focal_watch import FocalLook, FocalWatch
+from arview.tracking.self_calibration.focal_watch import FocalWatch, FrameFocal
 from helpers.synthetic import assembly_views, picture, pose_from
 
 GIVEN = guess_camera(640, 480)
@@ -27,7 +27,7 @@ def watched(watch: FocalWatch, true: Camera, poses: list[Array], first: int = 0)
         image = picture(pose, camera=true, seed=index, scene=1, noise=3.0)
         body = pose_seen_by(pose @ part.model_from_body, true, GIVEN)
         seen = Pose(body @ part.body_from_model, np.eye(6), 0.95, TrackingState.TRACKED, index / 30.0, index)
-        found.append(watch.judged(image, seen, index, has_jumped=index == first))
+        found.append(watch.checked(image, seen, index, has_jumped=index == first))
     return found
 
 
@@ -58,7 +58,7 @@ def test_the_right_camera_is_not_doubted_and_a_zoom_later_is_a_change() -> None:
 
 
 def test_few_lines_need_a_larger_difference() -> None:
-    box, assembly = FocalLook(0.06, 0.01, 9), FocalLook(0.06, 0.01, 20)
+    box, assembly = FrameFocal(0.06, 0.01, 9), FrameFocal(0.06, 0.01, 20)
     assert not box.contradicts(False) and assembly.contradicts(False) and not assembly.contradicts(True)
-    assert FocalLook(0.2, 0.01, 9).contradicts(True) and not FocalLook(0.2, 0.08, 20).contradicts(False)
-    assert not FocalLook(0.2, 0.01, 9).agrees(FocalLook(-0.2, 0.01, 9))
+    assert FrameFocal(0.2, 0.01, 9).contradicts(True) and not FrameFocal(0.2, 0.08, 20).contradicts(False)
+    assert not FrameFocal(0.2, 0.01, 9).agrees(FrameFocal(-0.2, 0.01, 9))

@@ -200,7 +200,7 @@ class TrackingSession:
         self._separate()
         if self.camera_estimate is not None:
             self._poses[0] = self._calibrated(image, self._poses[0], self.camera_estimate)
-        self._poses[0] = self._judged(image, self._poses[0])
+        self._poses[0] = self._checked(image, self._poses[0])
         for number, pose in self._poses.items():
             is_followed = pose.cam_from_model is not None
             self._followed_frames[number] = self._followed_frames[number] + 1 if is_followed else 0
@@ -245,7 +245,7 @@ class TrackingSession:
         estimate.add(image, pose)
         return pose
 
-    def _judged(self, image: NDArray[np.uint8], pose: Pose) -> Pose:
+    def _checked(self, image: NDArray[np.uint8], pose: Pose) -> Pose:
         """The pose of the first specimen, critical where the picture contradicts the focal length."""
         watch, before_mm = self.focal_watch, self._depth_mm
         if watch is None or pose.cam_from_model is None:
@@ -254,7 +254,7 @@ class TrackingSession:
         has_jumped = before_mm > 0.0 and abs(math.log(max(self._depth_mm, 1.0) / before_mm)) > DEPTH_JUMP
         if watch.contradiction is None and not has_jumped and self._frames < watch.due:
             return pose
-        return watch.judged(image, pose, self._frames, has_jumped)
+        return watch.checked(image, pose, self._frames, has_jumped)
 
     def _searched(self) -> list[int]:
         """The specimen without a pose whose turn it is to be searched for in this frame; none if all have one."""

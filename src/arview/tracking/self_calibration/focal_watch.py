@@ -22,7 +22,7 @@ from arview.tracking.self_calibration.frame_set import cropped_frame
 
 FIRST_EVERY, EVERY = 6, 60
 """Frames between two looks, for the first looks and after them; a look costs as much as tracking a frame."""
-FIRST_LOOKS = 4
+FIRST_ESTIMATES = 4
 """Looks until the focal length is taken to be settled."""
 MAX_STD = 0.015
 """Relative standard uncertainty above which a frame says too little: flat parts, and small ones."""
@@ -37,7 +37,7 @@ MIN_QUALITY = 0.5
 
 
 @dataclass(frozen=True)
-class FocalLook:
+class FrameFocal:
     """The focal length that one frame shows.
 
     Attributes:
@@ -55,7 +55,7 @@ class FocalLook:
         least = SMALL_DIFFERENCE if self.lines >= MANY_LINES and not is_settled else MIN_DIFFERENCE
         return abs(self.log_ratio) > max(least, CONTRADICTION * self.std)
 
-    def agrees(self, other: FocalLook) -> bool:
+    def agrees(self, other: FrameFocal) -> bool:
         """Whether two frames show the same focal length."""
         return abs(self.log_ratio - other.log_ratio) < max(SMALL_DIFFERENCE, CONTRADICTION * self.std)
 
@@ -70,22 +70,22 @@ class FocalWatch:
         camera: as it was given.
 
     Attributes:
-        contradiction: the last look, while the pictures contradict the focal length; otherwise None.
+        contradiction: what the last frame showed, while the pictures contradict the focal length; otherwise None.
         has_changed: whether they agreed with it before.
         due: number of frames from which on the next look is due.
     """
 
     def __init__(self, views: GuideViewSet, camera: Camera) -> None:
-        self.contradiction: FocalLook | None = None
+        self.contradiction: FrameFocal | None = None
         self.has_changed = False
         self.due = 0
         self._camera = camera
         self._part = PartView(views)
         self._adjustment = FocalAdjustment(self._part, camera)
-        self._last: FocalLook | None = None
-        self._looks = 0
+        self._last: FrameFocal | None = None
+        self._estimates = 0
 
-    def judged(self, image: NDArray[np.uint8], pose: Pose, frames: int, has_jumped: bool = False) -> Pose:
+    def checked(self, image: NDArray[np.uint8], pose: Pose, frames: int, has_jumped: bool = False) -> Pose:
         """The pose of a frame (H,W,3); where the focal length is contradicted it is critical, and says by how much.
 
         Args:
@@ -106,7 +106,7 @@ class FocalWatch:
     @property
     def text(self) -> Message:
         """What is said while the focal length is contradicted."""
-        found = self.contradiction or FocalLook(0.0, 0.0, 0)
+        found = self.contradiction or FrameFocal(0.0, 0.0, 0)
         ratio = float(np.exp(found.log_ratio))
         key = "tracking.focal_changed" if self.has_changed else "tracking.focal_wrong"
         given, seen = f"{self._camera.fx:.0f}", f"{self._camera.fx * ratio:.0f}"
@@ -114,20 +114,20 @@ class FocalWatch:
 
     def _watch(self, image: NDArray[np.uint8], pose: Pose, frames: int) -> None:
         """Look at a frame, and decide by this look and the one before."""
-        look = self._look(image, pose)
-        self._looks += 1
-        self.due = frames + (FIRST_EVERY if self._looks < FIRST_LOOKS else EVERY)
-        if look is None:
+        shown = self._estimate(image, pose)
+        self._estimates += 1
+        self.due = frames + (FIRST_EVERY if self._estimates < FIRST_ESTIMATES else EVERY)
+        if shown is None:
             return
-        before, self._last = self._last, look
-        is_against = look.contradicts(self.has_changed)
-        if is_against and (before is None or not look.agrees(before)):
+        before, self._last = self._last, shown
+        is_against = shown.contradicts(self.has_changed)
+        if is_against and (before is None or not shown.agrees(before)):
             self.due = frames + 1  # the next frame confirms it
             return
         self.has_changed |= not is_against
-        self.contradiction = look if is_against else None
+        self.contradiction = shown if is_against else None
 
-    def _look(self, image: NDArray[np.uint8], pose: Pose) -> FocalLook | None:
+    def _estimate(self, image: NDArray[np.uint8], pose: Pose) -> FrameFocal | None:
         """The focal length that a frame shows; None where it shows too little."""
         assert pose.cam_from_model is not None
         body = pose.cam_from_model @ self._part.model_from_body
@@ -141,4 +141,4 @@ class FocalWatch:
         if found is None or found.log_focal_std > MAX_STD:
             return None
         log_ratio = float(np.log(found.camera.fx / self._camera.fx))
-        return FocalLook(log_ratio, found.log_focal_std, self._adjustment.lines(frame, self._camera))
+        return FrameFocal(log_ratio, found.log_focal_std, self._adjustment.lines(frame, self._camera))
