@@ -15,7 +15,7 @@ from arview.reconstruction.coverage import coverage
 HIDDEN_EDGES = 0.25
 """Share of the CAD's edges, beyond chance, below which most of the part is hidden."""
 MOSTLY_HIDDEN = "nothing of it is seen, and as most of the part is hidden, whether it is missing cannot be told"
-UNDER_FOREIGN = "nothing of it is seen, because a foreign object lies on its place; take that away and measure again"
+UNDER_FOREIGN = "a foreign object lies on its place, so what is seen there may be of that; take it away, measure again"
 FOREIGN_MARGIN_MM = 4.0
 """Margin about a foreign object in which the middle of a component is covered: its cloud ends before its rim."""
 
@@ -60,9 +60,10 @@ def is_mostly_hidden(consistency: Consistency) -> bool:
 
 def is_covered(center_mm: Sequence[float], foreign: Sequence[ForeignReport]) -> bool:
     """Whether one of the foreign objects lies on the place of a component, with its centre in the same frame."""
-    sizes = (0.5 * np.array(one.size_mm) + FOREIGN_MARGIN_MM for one in foreign)
-    apart = (np.abs(np.array(center_mm) - one.center_mm) for one in foreign)
-    return any(bool(np.all(gap < size)) for gap, size in zip(apart, sizes, strict=True))
+    return any(
+        bool(np.all(np.abs(np.subtract(center_mm, one.center_mm)) < 0.5 * np.array(one.size_mm) + FOREIGN_MARGIN_MM))
+        for one in foreign
+    )
 
 
 def with_covered(record: ComponentDeviation) -> ComponentDeviation:

@@ -24,7 +24,7 @@ from arview.core.progress import Progress
 from arview.errors import CannotMeasureError
 from arview.geometry import Array, rigid
 from arview.reconstruction.adjustment.bundle import lens_terms, with_own_lenses
-from arview.reconstruction.adjustment.equations import mean_lens, with_covariance
+from arview.reconstruction.adjustment.equations import usual_lenses, with_covariance
 from arview.reconstruction.colmap import import_pycolmap, model_of_poses
 from arview.reconstruction.database import emptied, write_database, write_matches
 from arview.reconstruction.features import Features
@@ -82,7 +82,9 @@ class EarlierPhotos:
         self.whole, self.options, self.memory = whole, options, memory
         self.threads = options.sparse.threads or os.cpu_count() or 1
         given = {photo.name: photo for photo in photos}
-        self.usual = None if whole.lens_stds is None else mean_lens([photo.camera for photo in whole.photos])
+        self.usual = None if whole.lens_stds is None else usual_lenses(whole.photos)
+        known = self.usual or {one.name: one.camera for one in whole.photos}
+        self.lenses = {given[name].lens: camera for name, camera in known.items()}
         self.photos = [self._with_lens(given[one.name], one.camera) for one in whole.photos]
         found, _ = moving_features(self.photos, options.sparse, self.threads, _nothing, memory)
         self.features = [
@@ -181,8 +183,7 @@ class EarlierPhotos:
         folder.mkdir(parents=True, exist_ok=True)
         device = torch_device(sparse.device)
         features = [self.memory.features(photo, sparse.features, device) for photo in photos]
-        lenses = {photo.lens: photo.camera for photo in self.photos}
-        photos = [self._with_lens(photo, self.usual or lenses.get(photo.lens, photo.camera)) for photo in photos]
+        photos = [self._with_lens(photo, self.lenses.get(photo.lens, photo.camera)) for photo in photos]
         tell("matching", 0, 1)
         placed, left_out, kept = [], [], []
         for photo, one, (points, pixels) in zip(photos, features, self.match(photos, features, poses), strict=True):
@@ -209,7 +210,8 @@ class EarlierPhotos:
         model, _ = triangulate_and_adjust(model, path, folder, sparse, self.threads, tell, keeps_centre=True)
         found, split = main_group(model, False, joint, self.threads)
         if self.usual is not None:
-            own = with_own_lenses(model, joint, self.usual)
+            usual = {photo.name: photo.camera for photo in photos} | self.usual
+            own = with_own_lenses(model, joint, usual)
             found = with_covariance(own, lens_terms(model, own, False))
         color_points(model, everything)
         scale, motion = onto(found, self.whole)

@@ -18,7 +18,7 @@ from arview.core.fits import fit_similarity
 from arview.errors import CannotMeasureError
 from arview.geometry import Array
 from arview.reconstruction.adjustment.bundle import adjust, adjust_with_centre, lens_terms, with_own_lenses
-from arview.reconstruction.adjustment.equations import mean_lens, with_covariance
+from arview.reconstruction.adjustment.equations import usual_lenses, with_covariance
 from arview.reconstruction.colmap import import_pycolmap, read_reconstruction, sparse_model_of
 from arview.reconstruction.groups import MIN_SHARED_POINTS, linked_groups
 from arview.reconstruction.sparse import MAX_ERROR_PX, MIN_ANGLE_DEG, SparseOptions
@@ -84,7 +84,7 @@ def adjusted_alone(
     adjust(model, threads, refines_centre=refines_centre)
     sparse = sparse_model_of(model, listed)
     if whole.lens_stds is not None:
-        sparse = with_own_lenses(model, listed, mean_lens([photo.camera for photo in whole.photos]))
+        sparse = with_own_lenses(model, listed, usual_lenses(whole.photos))
     sparse = with_covariance(sparse, lens_terms(model, sparse, refines_centre))
     if len(linked_groups(sparse)) > 1:
         raise CannotMeasureError(f"{named} are not placed without the others")

@@ -32,7 +32,6 @@ from arview.reconstruction.adjustment.bundle import (
 )
 from arview.reconstruction.adjustment.equations import (
     LensTerms,
-    mean_lens,
     with_covariance,
     with_lens_per_photo,
 )
@@ -214,7 +213,7 @@ def _lenses_of_their_own(
     found = with_lens_per_photo(sparse, terms)
     if found is None:
         return sparse
-    usual = mean_lens([photo.camera for photo in sparse.photos])
+    usual = {photo.name: photo.camera for photo in sparse.photos}
     given = {photo.name: index for index, photo in enumerate(photos)}
     places = [given[photo.name] for photo in sparse.photos]
     seen = [features[place] for place in places]

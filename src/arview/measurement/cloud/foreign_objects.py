@@ -90,8 +90,6 @@ def find_foreign(
     surface = MeshSurface(np.concatenate(parts), faces, groups)
     edges = cKDTree(_edge_points(model, places))
     far = points.points[_is_beside(points, surface, edges, model)]
-    if len(far) == 0:
-        return []
     for name in unknown:
         low, high = model.component(name).bounds_in_model
         reach = float(np.linalg.norm(high - low))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -44,8 +44,7 @@ def adjust(model: Any, threads: int, refines_centre: bool, iterations: int = 25,
     for camera in model.cameras.values():
         if not _is_refined(camera):
             config.set_constant_cam_intrinsics(camera.camera_id)
-    adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, model)
-    adjuster.solve()
+    pycolmap.create_default_ceres_bundle_adjuster(options, config, model).solve()
     model.update_point_3d_errors()
 
 
@@ -77,17 +76,17 @@ def lens_terms(model: Any, sparse: SparseModel, refines_centre: bool) -> LensTer
     return LensTerms(np.array(numbers, dtype=np.int64), refines_centre)
 
 
-def with_own_lenses(model: Any, photos: Sequence[Photo], usual: Camera) -> SparseModel:
+def with_own_lenses(model: Any, photos: Sequence[Photo], usual: Mapping[str, Camera]) -> SparseModel:
     """A model of COLMAP's with a lens for each photo, adjusted with all of them; also in place.
 
     Args:
         model: whose photos have a camera each.
         photos: of it.
-        usual: the lens around which theirs change.
+        usual: the lens around which each one changes, by the name of the photo.
     """
-    sparse = sparse_model_of(model, photos)
-    cameras = [usual] * len(sparse.photos)
-    sparse = with_lens_per_photo(sparse, lens_terms(model, sparse, False), cameras) or sparse
+    start = sparse_model_of(model, photos)
+    cameras = [usual[photo.name] for photo in start.photos]
+    sparse = with_lens_per_photo(start, lens_terms(model, start, False), cameras) or start
     update_model(model, sparse)
     return sparse
 
@@ -107,11 +106,10 @@ def photos_of_two_lenses(
         return None
     groups, focals = found
     group_of = {photo.name: one for photo, one in zip(sparse.photos, groups, strict=True)}
+    most = int(2 * sum(groups) > len(groups))  # for photos that were not placed
     split = []
     for photo in photos:
-        group = group_of.get(photo.name)
-        if group is None:  # it was not placed, and is tried with the lens of most
-            group = int(2 * sum(groups) > len(groups))
+        group = group_of.get(photo.name, most)
         camera = replace(photo.camera, fx=focals[group], fy=focals[group])
         split.append(replace(photo, lens=f"{photo.lens}{ZOOM_WORD}{group + 1}", camera=camera))
     listed = [named([name for name, one in group_of.items() if one == group], 4) for group in (0, 1)]

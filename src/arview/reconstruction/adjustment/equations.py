@@ -25,7 +25,7 @@ from arview.reconstruction.adjustment.covariance import (
     noise_variance_of,
     reprojection_residuals,
 )
-from arview.reconstruction.types import SparseModel
+from arview.reconstruction.types import PosedPhoto, SparseModel
 
 ZOOM_STD, MIN_ZOOM, MIN_GROUP = 0.3, 0.08, 3
 """Relative differences of focal lengths between lenses of one phone: expected, and least; and photos of each."""
@@ -215,9 +215,7 @@ def with_lens_per_photo(
         if inverse is None:
             return None
         step = inverse @ equations.right
-        if np.abs(step[own]).max() > max(
-            MAX_LENS_STEP, focal_std
-        ):  # another camera or zoom, which is no change of one lens
+        if np.abs(step[own]).max() > max(MAX_LENS_STEP, focal_std):
             return None
         sparse, changes = _moved(sparse, terms, equations, step), changes + step[own]
         # Variance components: expectation and maximisation, both directions of the principal point alike.
@@ -280,6 +278,13 @@ def mean_lens(cameras: Sequence[Camera]) -> Camera:
     """The lens in the middle of several that differ in focal length and principal point alone."""
     focal, *centre = np.mean([_change(one, cameras[0]) for one in cameras], axis=0)
     return _changed(cameras[0], focal, centre)
+
+
+def usual_lenses(photos: Sequence[PosedPhoto]) -> dict[str, Camera]:
+    """For each photo, by its name, the lens in the middle of those of its size and distortion: of one lens."""
+    kinds = {one.name: (one.camera.width, one.camera.height, *one.camera.dist) for one in photos}
+    of_kind = {kind: [one.camera for one in photos if kinds[one.name] == kind] for kind in kinds.values()}
+    return {name: mean_lens(of_kind[kind]) for name, kind in kinds.items()}
 
 
 def _changed(camera: Camera, focal: float, centre: Sequence[float]) -> Camera:
