@@ -20,7 +20,7 @@ from arview.measurement.cloud.deviation import measure_components_in_cloud
 from arview.measurement.cloud.distance_map import (
     distance_map,
     full_width_at_half_maximum,
-    histogram_picture,
+    histogram_png,
     map_picture,
     write_distance_ply,
 )
@@ -275,7 +275,7 @@ def test_distance_map(cloud, model, moved, tmp_path):
     write_distance_ply(there, tmp_path / "d.ply")
     back = trimesh.load(tmp_path / "d.ply")
     assert np.allclose(back.vertices, there.points_in_model, atol=1e-4)
-    picture = histogram_picture(there, model, POST)
+    picture = cv2.imdecode(np.frombuffer(histogram_png(there, model, POST), np.uint8), cv2.IMREAD_COLOR)
     assert picture.shape == (600, 960, 3)
     assert (picture < 128).any()
     seen = map_picture(nominal, limit_mm=1.0)

@@ -33,7 +33,7 @@ from arview.measurement.uncertainty.pose_propagation import (
     shifts_from_poses,
     visibility,
 )
-from arview.measurement.uncertainty.rice import rice_density, rice_estimate, rice_mean
+from arview.measurement.uncertainty.rice import rice_estimate
 from arview.reconstruction.types import PosedPhoto, SparseModel
 from helpers.photo_scene import CAMERA, bench, ring
 
@@ -89,11 +89,6 @@ def test_rice_against_simulation(axes: int, true: float) -> None:
     noise = rng.normal(0, 0.3, (200_000, axes))
     noise[:, 0] += true
     lengths = np.linalg.norm(noise, axis=1)
-    counts, edges = np.histogram(lengths, bins=40, range=(0, 2.5), density=False)
-    middle = 0.5 * (edges[1:] + edges[:-1])
-    expected = rice_density(middle, true, 0.3, axes) * len(lengths) * (edges[1] - edges[0])
-    assert np.abs(counts - expected).max() < 5 * np.sqrt(expected.max()) + 0.01 * expected.max()
-    assert rice_mean(true, 0.3, axes) == pytest.approx(lengths.mean(), abs=0.003)
     found = rice_estimate(lengths[:20_000], 0.3, axes)
     # At zero the likelihood is flat: its curvature vanishes, and what is left is of fourth root of the number.
     assert found == pytest.approx(true, abs=0.05 if true < 0.3 else 0.01)
@@ -102,8 +97,6 @@ def test_rice_against_simulation(axes: int, true: float) -> None:
 def test_rice_at_its_ends() -> None:
     assert rice_estimate(0.4, 0.3) == 0.0  # below √2 σ noise alone explains it
     assert rice_estimate(3.0, 0.03) == pytest.approx(3.0, abs=1e-3)
-    assert rice_mean(100.0, 0.1) == pytest.approx(100.0 + 0.5 * 0.01 / 100, abs=1e-9)
-    assert rice_mean(0.0, 1.0) == pytest.approx(np.sqrt(np.pi / 2))
     for bad in ({"sigma": 0.0}, {"sigma": 1.0, "axes": 4}):
         with pytest.raises(InputError, match="rice"):
             rice_estimate(1.0, **bad)  # type: ignore[arg-type]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from pathlib import Path
+from runpy import run_path
 from typing import Any
 
 import click
@@ -34,7 +35,6 @@ def on_page_markdown(markdown: str, page: Page, config: Any, files: Files) -> st
 def generated_pages() -> Iterator[tuple[str, str]]:
     """Path and text of each page that is made from the program."""
     from arview.cad import PART_FILE_EXAMPLE
-    from arview.inspection.schema_doc import schema_markdown
 
     yield "reference/commands.md", "\n".join(command_page())
     yield (
@@ -42,7 +42,7 @@ def generated_pages() -> Iterator[tuple[str, str]]:
         "# Part file\n\nA part file adds to a CAD file what it does not say. All but `cad` has a default. Keys that "
         f"are not known are an error.\n\n```toml\n{PART_FILE_EXAMPLE}```\n",
     )
-    yield "reference/inspection-json.md", schema_markdown()
+    yield "reference/inspection-json.md", run_path(str(Path(__file__).with_name("schema_page.py")))["schema_markdown"]()
     yield "reference/api.md", "\n".join(api_page())
 
 

@@ -117,19 +117,6 @@ def draw_surface(
             drawn[3, v, u] = min(max((1.0 / inverse_depth[v, u] - place[2]) / half_mm, -1.0), 1.0)
 
 
-def differing(one: NDArray[np.float32], other: NDArray[np.float32], normal: float, depth: float) -> NDArray[np.bool_]:
-    """Pixels (H,W) at which two drawings (4,H,W) of `draw_surface` differ.
-
-    Args:
-        one, other: the drawings.
-        normal: largest difference of a component of the normals that is no difference.
-        depth: the same of the depth.
-    """
-    off = np.abs(one - other)
-    is_one, is_other = one[2] != 0.0, other[2] != 0.0
-    return np.asarray((is_one != is_other) | (off[:3].max(axis=0) > normal) | (off[3] > depth))
-
-
 def reduced_surface(model: Model) -> tuple[NDArray[np.float32], NDArray[np.int32], NDArray[np.int16]]:
     """The mesh of a model, reduced to at most MAX_FACES faces by merging the vertices of each cell into their mean.
 

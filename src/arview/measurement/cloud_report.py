@@ -6,22 +6,23 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from arview.cad import Model
+from arview.core.atomic import write_file
 from arview.errors import InputError, OutputError
 from arview.geometry import apply, invert
 from arview.inspection import ComponentDeviation, DistanceReport, ForeignReport, Verdict
 from arview.measurement.cloud.distance_map import (
     DistanceMap,
     distance_map,
-    histogram_picture,
+    histogram_png,
     map_picture,
     write_distance_ply,
 )
 from arview.measurement.cloud.foreign_objects import ForeignObject, find_foreign
 from arview.measurement.datums.alignment import Alignment
-from arview.measurement.plot import save_picture
 from arview.reconstruction import DenseCloud
 
 MIN_SCATTER = 1e-5
@@ -86,13 +87,14 @@ def write_distance_map(distances: DistanceMap, model: Model, folder: Path) -> tu
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(f"{folder}: cannot be created ({error.strerror or error})") from error
-    pictures = {"map.png": map_picture(distances), "histogram.png": histogram_picture(distances, model)}
+    drawn = cv2.imencode(".png", cv2.cvtColor(map_picture(distances), cv2.COLOR_RGB2BGR))[1].tobytes()
+    pictures = {"map.png": drawn, "histogram.png": histogram_png(distances, model)}
     for row in distances.statistics[1:]:
         name = "".join(c if c.isalnum() or c in "-_" else "_" for c in row.name)
-        pictures[f"histogram_{name}.png"] = histogram_picture(distances, model, row.name)
+        pictures[f"histogram_{name}.png"] = histogram_png(distances, model, row.name)
     write_distance_ply(distances, folder / "distances.ply")
     for name, picture in pictures.items():
-        save_picture(picture, folder / name)
+        write_file(folder / name, picture)
     return tuple(f"{folder.name}/{name}" for name in ("distances.ply", *pictures))
 
 

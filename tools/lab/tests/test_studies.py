@@ -8,7 +8,7 @@ from click.testing import CliRunner
 
 from arview.cli import main
 from arview.errors import OutputError
-from arview.measurement.plot import Chart, save_picture, stack
+from arview_lab.chart import Chart, save_picture, stack
 from arview_lab.studies import (
     density_study,
     displacement_study,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,12 +13,12 @@ from numpy.typing import NDArray
 
 from arview.cad import Model
 from arview.core.atomic import write_file
+from arview.core.figures import figure
 from arview.core.fits import robust_sigma
 from arview.errors import InputError
 from arview.geometry import Array, apply, look_at
 from arview.inspection import DistanceStatistics
 from arview.measurement.cloud.mesh_surface import MeshSurface
-from arview.measurement.plot import Chart, Picture
 from arview.reconstruction import DenseCloud
 
 _BINS = 400
@@ -120,24 +121,21 @@ def read_distance_ply(path: Path, reach_mm: float, statistics: tuple[DistanceSta
     return DistanceMap(points, rows["distance_mm"].astype(np.float64), np.full(count, -1), reach_mm, statistics)
 
 
-def histogram_picture(distances: DistanceMap, model: Model, component: str | None = None) -> Picture:
-    """Histogram of the distances of a component, or of all, with its statistics, as (H,W,3) uint8 RGB."""
+def histogram_png(distances: DistanceMap, model: Model, component: str | None = None) -> bytes:
+    """Histogram of the distances of a component, or of all, with its statistics, as a PNG file."""
     name = component or _WHOLE
     row = next((item for item in distances.statistics if item.name == name), None)
     if row is None:
         raise InputError(f"distance map: no points of {name!r}")
-    mine = (
-        np.ones(len(distances.distances), bool)
-        if component is None
-        else (distances.components == model.index(component))
-    )
+    mine = distances.components == model.index(component) if component else np.ones(len(distances.distances), bool)
     span = min(distances.reach_mm, max(6.0 * row.fwhm_mm, 0.05))
-    edges = np.linspace(row.median_mm - span, row.median_mm + span, 81)
-    count, _ = np.histogram(distances.distances[mine], edges)
-    title = f"{name}: mean {row.mean_mm:+.3f}, sigma {row.sigma_mm:.3f}, FWHM {row.fwhm_mm:.3f} mm"
-    chart = Chart(title, f"signed distance of {row.count} points to the CAD / mm", "points")
-    chart.add(0.5 * (edges[1:] + edges[:-1]), count, "", "bars")
-    return chart.draw()
+    out = io.BytesIO()
+    with figure(4.0, 6.4) as (made, axes):
+        axes.hist(distances.distances[mine], 80, (row.median_mm - span, row.median_mm + span), color="#2b5c8a")
+        axes.set(xlabel=f"signed distance of {row.count} points to the CAD / mm", ylabel="points")
+        axes.set_title(f"{name}: mean {row.mean_mm:+.3f}, sigma {row.sigma_mm:.3f}, FWHM {row.fwhm_mm:.3f} mm", size=10)
+        made.savefig(out, format="png", dpi=150)
+    return out.getvalue()
 
 
 def map_picture(
@@ -146,7 +144,7 @@ def map_picture(
     limit_mm: float = 1.0,
     width: int = 1200,
     height: int = 900,
-) -> Picture:
+) -> NDArray[np.uint8]:
     """The points in their colours in parallel projection from a direction, with a scale, as (H,W,3) uint8 RGB."""
     points = distances.points_in_model
     middle = 0.5 * (points.min(axis=0) + points.max(axis=0))

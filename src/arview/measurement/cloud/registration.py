@@ -112,12 +112,6 @@ class Registration:
     runner_up: Array | None = None
     runner_up_cost: float | None = None
 
-    @property
-    def naive_covariance(self) -> Array:
-        """(6,6) covariance for independent errors, for comparison; far too small for real clouds."""
-        basis = orthogonal_complement(self.undetermined, self.free) * _scales(self.radius_mm)
-        return basis.T @ np.linalg.inv(basis @ self.information @ basis.T) @ basis * self.sigma_mm**2
-
 
 def degrees_of_freedom(names: str, axes: Array | None = None) -> Array:
     """Directions (K,6) of names like ``"rz tx ty"``, about and along ``axes`` (3,3) given as rows; default XYZ.

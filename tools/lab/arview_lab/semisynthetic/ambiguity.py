@@ -12,7 +12,7 @@ from arview.cad.model import Model
 from arview.cad.shape.symmetry import Symmetry
 from arview.camera import Camera
 from arview.geometry import Array
-from arview.guideviews.surface import Surface, differing, draw_surface
+from arview.guideviews.surface import Surface, draw_surface
 from arview.rendering.renderers import ZBufferRenderer
 from arview_lab.evaluation.metrics import PoseError, PoseMeter, symmetry_group
 
@@ -83,6 +83,19 @@ def changed_share(surface: Surface, diameter_mm: float, cam_from_body: Array, tr
     one, true = shown
     is_other = differing(one, true, OTHER_NORMAL, OTHER_DEPTH)
     return int(np.count_nonzero(is_other)) / max(1, int(np.count_nonzero(true[2])))
+
+
+def differing(one: NDArray[np.float32], other: NDArray[np.float32], normal: float, depth: float) -> NDArray[np.bool_]:
+    """Pixels (H,W) at which two drawings (4,H,W) of `draw_surface` differ.
+
+    Args:
+        one, other: the drawings.
+        normal: largest difference of a component of the normals that is no difference.
+        depth: the same of the depth.
+    """
+    off = np.abs(one - other)
+    is_one, is_other = one[2] != 0.0, other[2] != 0.0
+    return np.asarray((is_one != is_other) | (off[:3].max(axis=0) > normal) | (off[3] > depth))
 
 
 def nearest_error(meter: PoseMeter, estimate: Array, truths: tuple[Array, ...]) -> PoseError:

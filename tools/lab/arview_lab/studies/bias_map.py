@@ -11,8 +11,8 @@ from arview.errors import InputError
 from arview.geometry import Array, apply
 from arview.measurement.cloud.mesh_surface import MeshSurface
 from arview.measurement.cloud.registration import RegistrationOptions, register_to_surface
-from arview.measurement.plot import Chart, Picture, stack
 from arview.reconstruction.scale.cad import base_names
+from arview_lab.chart import Chart, Picture, stack
 from arview_lab.studies.cloud_registration import cloud_of_part, true_places
 from arview_lab.studies.common import Study
 

@@ -26,10 +26,10 @@ from arview.measurement.cloud.deviation import (
 )
 from arview.measurement.cloud.points import CloudPoints, prepare_cloud
 from arview.measurement.folder import in_model_frame, read_cloud
-from arview.measurement.plot import Chart
 from arview.measurement.types import Move, NotMeasured
 from arview.reconstruction.scale.cad import base_names
 from arview.reconstruction.types import DenseCloud
+from arview_lab.chart import Chart
 from arview_lab.cloud.classical_icp import ClassicalIcpOptions, icp_move
 from arview_lab.studies.common import Study
 

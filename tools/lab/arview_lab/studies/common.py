@@ -18,7 +18,7 @@ from arview.errors import OutputError
 from arview.geometry import Array
 from arview.measurement.cloud.mesh_surface import MeshSurface
 from arview.measurement.cloud.registration import RegistrationOptions
-from arview.measurement.plot import Picture, save_picture
+from arview_lab.chart import Picture, save_picture
 
 T = TypeVar("T")
 R = TypeVar("R")

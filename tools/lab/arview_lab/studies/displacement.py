@@ -9,7 +9,7 @@ import numpy as np
 from arview.geometry import Array
 from arview.measurement.cloud.mesh_surface import MeshSurface
 from arview.measurement.cloud.registration import register_to_surface
-from arview.measurement.plot import Chart, stack
+from arview_lab.chart import Chart, stack
 from arview_lab.studies.common import EXACT, POST_MM, SECOND_POST_MM, Study, over_cores, post, sideways
 
 SIGMA_MM = 0.1

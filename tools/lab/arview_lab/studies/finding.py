@@ -15,7 +15,7 @@ from arview.geometry import Array, apply, exp_so3, invert, rigid
 from arview.measurement.cloud.mesh_surface import MeshSurface
 from arview.measurement.cloud.open3d_library import load_open3d
 from arview.measurement.cloud.pair_registration import find_by_pairs
-from arview.measurement.plot import Chart
+from arview_lab.chart import Chart
 from arview_lab.studies.common import Study
 
 POINTS = 12_000

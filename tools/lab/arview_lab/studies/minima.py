@@ -11,7 +11,7 @@ from arview.errors import InputError
 from arview.geometry import Array, apply, rigid
 from arview.measurement.cloud.mesh_surface import MeshSurface
 from arview.measurement.cloud.registration import register_from_starts, register_to_surface
-from arview.measurement.plot import Chart, stack
+from arview_lab.chart import Chart, stack
 from arview_lab.cloud.classical_icp import ClassicalIcpOptions, classical_icp
 from arview_lab.studies.common import EXACT, Study, post
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from arview.geometry import Array
 from arview.measurement.cloud.registration import register_to_surface
-from arview.measurement.plot import Chart, stack
+from arview_lab.chart import Chart, stack
 from arview_lab.cloud.shape_fits import fit_cylinder
 from arview_lab.studies.common import EXACT, Study, over_cores, post, sideways
 

@@ -22,9 +22,9 @@ from arview.geometry import Array, apply
 from arview.inspection import ComponentDeviation, Inspection
 from arview.measurement.folder import MetricReconstruction, in_model_frame, read_folder
 from arview.measurement.options import MeasureOptions
-from arview.measurement.plot import Chart, stack
 from arview.measurement.run import measure
 from arview.reconstruction.halves import adjusted_alone
+from arview_lab.chart import Chart, stack
 from arview_lab.studies.cloud_registration import true_places
 from arview_lab.studies.common import Study
 

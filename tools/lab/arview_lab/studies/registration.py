@@ -12,7 +12,7 @@ from arview.geometry import Array, apply
 from arview.measurement.cloud.mesh_surface import MeshSurface
 from arview.measurement.cloud.points import CloudPoints, grid_average
 from arview.measurement.cloud.registration import register_to_surface
-from arview.measurement.plot import Chart
+from arview_lab.chart import Chart
 from arview_lab.cloud.classical_icp import ClassicalIcpOptions, classical_icp
 from arview_lab.studies.common import EXACT, Study, post, sideways
 

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import ArrayLike
+from scipy.special import gamma, hyp1f1, ive
 
-from arview.measurement.plot import Chart, stack
-from arview.measurement.uncertainty.rice import rice_density, rice_estimate, rice_mean
+from arview.geometry import Array
+from arview.measurement.uncertainty.rice import rice_estimate
+from arview_lab.chart import Chart, stack
 from arview_lab.studies.common import Study
 
 SIGMA_MM = 0.3
@@ -40,3 +43,26 @@ def rice_study(is_quick: bool = False, seed: int = 0) -> Study:
     columns = ("offset_mm", "sigma_mm", "count", "mean_mm", "rice_mean_mm", "std_mm", "estimated_offset_mm")
     tables = {"rice": (columns, rows), "rice_histogram": (("offset_mm", "length_mm", "density", "rice"), bins)}
     return Study("rice", tables, stack(charts), tuple(summary))
+
+
+def rice_density(lengths: ArrayLike, true_length: float, sigma: float, axes: int = 2) -> Array:
+    """Density of measured lengths (...,) for a true length and the noise of each axis."""
+    r = np.asarray(lengths, dtype=np.float64) / sigma
+    a, order = true_length / sigma, 0.5 * axes - 1.0
+    if a < 1e-6:
+        density = 2.0 ** (-order) / gamma(0.5 * axes) * r ** (axes - 1) * np.exp(-0.5 * r**2)
+    else:
+        inside = np.where(r > 0, r, 1.0)
+        density = inside * (inside / a) ** order * np.exp(-0.5 * (inside - a) ** 2) * ive(order, inside * a)
+        at_zero = np.sqrt(2.0 / np.pi) * np.exp(-0.5 * a**2) if axes == 1 else 0.0
+        density = np.where(r > 0, density, at_zero)
+    return np.asarray(np.where(r >= 0, density / sigma, 0.0))
+
+
+def rice_mean(true_length: float, sigma: float, axes: int = 2) -> float:
+    """Mean of the measured lengths, which exceeds the true length."""
+    x = -0.5 * (true_length / sigma) ** 2
+    if x < -500.0:  # far from zero, use the series in σ/A
+        return true_length + 0.5 * (axes - 1) * sigma**2 / true_length
+    factor = np.sqrt(2.0) * gamma(0.5 * (axes + 1)) / gamma(0.5 * axes)
+    return float(sigma * factor * hyp1f1(-0.5, 0.5 * axes, x))

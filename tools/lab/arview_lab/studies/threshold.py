@@ -8,7 +8,7 @@ import numpy as np
 
 from arview.geometry import Array, apply
 from arview.measurement.cloud.registration import register_to_surface
-from arview.measurement.plot import Chart
+from arview_lab.chart import Chart
 from arview_lab.cloud.icp import (
     IcpOptions,
     IcpTarget,
