@@ -18,7 +18,8 @@ from typing import Protocol
 
 from arview.camera import Camera
 from arview.core.checks import check_type
-from arview.errors import OutputError, is_interruption
+from arview.core.stopping import until_stopped
+from arview.errors import OutputError
 from arview.pose import Completeness, Pose, Presence
 from arview.pose_file import PoseWriter
 from arview.tracking import FocalEstimate, TrackingSession
@@ -166,7 +167,7 @@ def annotate(
     try:
         outputs.open(overlay, poses_path, camera_of)
         try:
-            for frame in source:
+            for frame in until_stopped(source):
                 if start_s is not None and frame.time_s < start_s:
                     continue
                 if end_s is not None and frame.time_s >= end_s:
@@ -176,9 +177,7 @@ def annotate(
                 counts.add(poses)
                 if progress:
                     progress(len(counts.ms), poses[0])
-        except (KeyboardInterrupt, SystemError) as error:
-            if not is_interruption(error):
-                raise
+        except KeyboardInterrupt:
             counts.is_interrupted = True
         outputs.finish_drawing()
         if not counts.ms and not counts.is_interrupted:

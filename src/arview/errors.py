@@ -39,12 +39,3 @@ class CannotMeasureError(ArviewError):
 
 class OutputError(ArviewError):
     """A result could not be written (read-only folder, full disk)."""
-
-
-def is_interruption(error: BaseException | None) -> bool:
-    """Whether an exception is Ctrl-C, or came of it: compiled code makes a SystemError of it, whose cause it is."""
-    while error is not None:
-        if isinstance(error, KeyboardInterrupt):
-            return True
-        error = error.__cause__
-    return False

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -11,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from arview.camera import Camera
-from arview.core.atomic import unfinished_path
+from arview.core.atomic import begin_unfinished
 from arview.errors import OutputError
 from arview.pose import Pose
 
@@ -36,7 +35,7 @@ class PoseWriter:
     def __init__(self, path: str | Path, camera_of: Callable[[int], Camera] | None = None) -> None:
         self.path = Path(path)
         self._camera_of = camera_of
-        self._part = unfinished_path(self.path, os.getpid())
+        self._part = begin_unfinished(self.path)
         if self.path.is_dir():
             raise OutputError(f"{path}: is a folder; give the name of a file")
         try:

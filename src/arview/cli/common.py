@@ -21,7 +21,8 @@ from arview.cli.exit_codes import ExitCode, group_rows, help_rows
 from arview.core.atomic import is_device
 from arview.core.plug_ins import find_plug_ins, load_plug_in
 from arview.core.progress import Progress, StepProgress
-from arview.errors import ArviewError, CannotMeasureError, InputError, OutputError, is_interruption, without_credentials
+from arview.core.stopping import check_stop, stops_by_signals
+from arview.errors import ArviewError, CannotMeasureError, InputError, OutputError, without_credentials
 from arview.version import __version__
 
 if TYPE_CHECKING:
@@ -126,11 +127,9 @@ class _Program(Group):
     def invoke(self, ctx: click.Context) -> Any:
         """Run the chosen command; Ctrl-C ends it."""
         try:
-            with _closed_pipe_exits():
+            with _closed_pipe_exits(), stops_by_signals():
                 return super().invoke(ctx)
-        except (KeyboardInterrupt, SystemError) as error:
-            if not is_interruption(error):
-                raise
+        except KeyboardInterrupt:
             say("interrupted")
             ctx.exit(ExitCode.INTERRUPTED)
 
@@ -383,12 +382,13 @@ def load_pose(path: str) -> Array:
 
 @contextmanager
 def progress_bar(label: str, total: int | None = None) -> Iterator[StepProgress]:
-    """Show a bar on stderr if it is a terminal; yields the function that moves it."""
+    """Show a bar on stderr if it is a terminal; yields what moves it, and ends the work after Ctrl-C."""
     from tqdm import tqdm
 
     with tqdm(desc=label, total=total, disable=None, leave=False, unit="") as bar:
 
         def update(done: int, in_all: int) -> None:
+            check_stop()
             bar.total = in_all or None
             bar.update(done - bar.n)
 
@@ -397,7 +397,7 @@ def progress_bar(label: str, total: int | None = None) -> Iterator[StepProgress]
 
 @contextmanager
 def stage_bar() -> Iterator[Progress]:
-    """Show a bar for work in stages on stderr if it is a terminal; yields the function that moves it."""
+    """Show a bar for work in stages on stderr if it is a terminal; yields what moves it, see `progress_bar`."""
     from tqdm import tqdm
 
     with tqdm(disable=None, leave=False, unit="") as bar:
@@ -405,6 +405,7 @@ def stage_bar() -> Iterator[Progress]:
 
         def update(stage: str, done: int, in_all: int) -> None:
             nonlocal shown
+            check_stop()
             if stage != shown:
                 shown = stage
                 bar.reset(in_all or None)

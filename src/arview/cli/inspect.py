@@ -12,6 +12,7 @@ from arview import workflow
 from arview.cli.common import UNIT, main, say
 from arview.cli.exit_codes import ExitCode, exit_code_of
 from arview.core.progress import Progress
+from arview.core.stopping import check_stop
 from arview.quality import history
 
 if TYPE_CHECKING:
@@ -192,6 +193,7 @@ def line_bar(has_film: bool, is_from_video: bool, has_pdf: bool) -> Iterator[Pro
     with tqdm(total=100.0, disable=None, leave=False, bar_format="{desc} {percentage:3.0f} % |{bar}|") as bar:
 
         def show(moment: workflow.ProgressEstimate) -> None:
+            check_stop()
             bar.set_description_str(f"{moment.step:18}{workflow.time_text(moment):>18}", refresh=False)
             bar.update(100.0 * moment.share - bar.n)
 

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import glob
 import os
 import tempfile
+import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from functools import lru_cache
 from pathlib import Path
 from typing import BinaryIO
 
 from arview.errors import OutputError
+
+_LEFTOVER_S = 60.0
+"""Age of a temporary file whose process is gone, after which it is removed."""
 
 
 @contextmanager
@@ -26,7 +32,8 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
         with path.open("wb") as file:
             yield file
         return
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    _remove_leftovers(path.parent)
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.{os.getpid()}.", suffix=".tmp")
     try:
         with os.fdopen(handle, "wb") as file:
             yield file
@@ -59,6 +66,28 @@ def write_file(path: Path, content: bytes, makes_folder: bool = False) -> None:
 def is_device(path: Path) -> bool:
     """True for an existing device, pipe or socket: what is neither a file nor a folder."""
     return path.exists() and not path.is_file() and not path.is_dir()
+
+
+@lru_cache(maxsize=64)
+def _remove_leftovers(folder: Path) -> None:
+    """Remove files that a crash left behind while they were written in a folder; once in the life of a process."""
+    for path in folder.glob(".*.tmp"):
+        process = path.name.split(".")[-3]
+        with suppress(OSError):
+            is_old = time.time() - path.stat().st_mtime > _LEFTOVER_S  # a younger one may be another machine's
+            if process.isdecimal() and is_old and not _is_running(int(process)):
+                path.unlink()
+
+
+def begin_unfinished(path: Path) -> Path:
+    """Name under which this process writes a film or poses; what others left of the same file by a crash is removed."""
+    own = unfinished_path(path, os.getpid())
+    for old in path.parent.glob(f".{glob.escape(path.name)}.*.part"):
+        process = old.name.split(".")[-2]
+        if process.isdecimal() and not _is_running(int(process)):
+            with suppress(OSError):
+                old.unlink()
+    return own
 
 
 def unfinished_path(path: Path, process: int) -> Path:

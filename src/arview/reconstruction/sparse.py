@@ -12,6 +12,7 @@ import itertools
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -329,10 +330,16 @@ def _map(path: Path, folder: Path, options: SparseOptions, photo_count: int, tel
         str(folder),
         str(emptied(folder / "mapper")),
         mapping,
-        initial_image_pair_callback=lambda: tell("placing", 2, photo_count),
-        next_image_callback=lambda: tell("placing", min(next(placed), photo_count), photo_count),
+        initial_image_pair_callback=lambda: _tell_placed(tell, 2, photo_count),
+        next_image_callback=lambda: _tell_placed(tell, min(next(placed), photo_count), photo_count),
     )
     return [models[key] for key in sorted(models)]
+
+
+def _tell_placed(tell: Progress, count: int, photo_count: int) -> None:
+    """Tell from inside COLMAP's code, which must not be left by an exception: the next step outside it stops."""
+    with suppress(KeyboardInterrupt):
+        tell("placing", count, photo_count)
 
 
 # --- second pass -----------------------------------------------------------------------------------------

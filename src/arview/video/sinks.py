@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import os
 import queue
 import threading
 from collections.abc import Iterator
@@ -22,7 +21,7 @@ from av.packet import Packet
 from av.video.reformatter import ColorPrimaries, ColorRange, Colorspace, ColorTrc
 from av.video.stream import VideoStream
 
-from arview.core.atomic import unfinished_path
+from arview.core.atomic import begin_unfinished
 from arview.errors import OutputError
 from arview.video.frame import Image
 from arview.video.source import FrameSource
@@ -90,7 +89,7 @@ class VideoSink:
         rate = fps_hint if fps_hint is not None and 1.0 <= fps_hint <= 1000.0 else 30.0
         self._fps = Fraction(rate).limit_denominator(1001)
         self._layout = _FRAGMENTED if is_recoverable else _INDEX_IN_FRONT
-        self._part = unfinished_path(self.path, os.getpid())
+        self._part = begin_unfinished(self.path)
         if self.path.suffix.lower() not in CONTAINERS:
             raise OutputError(f"{path}: the name of the video must end in {', '.join(CONTAINERS)}")
         if not self.path.parent.is_dir():

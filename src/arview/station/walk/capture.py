@@ -19,7 +19,8 @@ from arview import reconstruction
 from arview.cad import Part
 from arview.camera import HEIF_SUFFIXES, PHOTO_SUFFIXES, Camera
 from arview.core.atomic import write_file
-from arview.errors import OutputError, is_interruption
+from arview.core.stopping import until_stopped
+from arview.errors import OutputError
 from arview.pose import Pose
 from arview.station import capture
 from arview.station.walk.job import FORMAT, VERSION, JobFolder
@@ -132,7 +133,7 @@ def capture_photos(
     advice: capture.CaptureAdvice | None = None
     frames, is_interrupted = 0, False
     try:
-        for frame in source:
+        for frame in until_stopped(source):
             frames += 1
             (pose,) = session.process(frame.image, frame.index, frame.time_s)
             camera = camera_of(frame.index)
@@ -154,9 +155,7 @@ def capture_photos(
                 progress(frames, advice)
             if advice.is_enough:
                 break
-    except (KeyboardInterrupt, SystemError) as error:
-        if not is_interruption(error):
-            raise
+    except KeyboardInterrupt:
         is_interrupted = True
     if photos:
         job.end()
