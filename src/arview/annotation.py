@@ -18,7 +18,7 @@ from typing import Protocol
 
 from arview.camera import Camera
 from arview.core.checks import check_type
-from arview.core.stopping import until_stopped
+from arview.core.progress import until_stopped
 from arview.errors import OutputError
 from arview.pose import Completeness, Pose, Presence
 from arview.pose_file import PoseWriter

@@ -30,7 +30,7 @@ from arview.cli.common import (
     start_session,
 )
 from arview.cli.exit_codes import ExitCode, finding_exit_code, presence_exit_code
-from arview.core.atomic import unfinished_path, writing_process
+from arview.core.atomic import writing_process
 from arview.errors import OutputError
 
 if TYPE_CHECKING:
@@ -270,7 +270,7 @@ def _check_outputs(
         if path and (writer := writing_process(Path(path))) is not None:
             raise OutputError(
                 f"{path}: process {writer} is writing it; wait until it ends or choose another name "
-                f"(if it is no arview, delete {unfinished_path(Path(path), writer)})"
+                f"(if it is no arview, delete {Path(path).with_name(f'.{Path(path).name}.{writer}.part')})"
             )
     return _Outputs(
         output_path(video, [*inputs]) if video else None,

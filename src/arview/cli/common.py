@@ -20,8 +20,7 @@ from arview import tracking
 from arview.cli.exit_codes import ExitCode, group_rows, help_rows
 from arview.core.atomic import is_device
 from arview.core.plug_ins import find_plug_ins, load_plug_in
-from arview.core.progress import Progress, StepProgress
-from arview.core.stopping import check_stop, stops_by_signals
+from arview.core.progress import Progress, StepProgress, check_stop, stops_by_signals
 from arview.errors import ArviewError, CannotMeasureError, InputError, OutputError, without_credentials
 from arview.version import __version__
 

@@ -11,8 +11,7 @@ import click
 from arview import workflow
 from arview.cli.common import UNIT, main, say
 from arview.cli.exit_codes import ExitCode, exit_code_of
-from arview.core.progress import Progress
-from arview.core.stopping import check_stop
+from arview.core.progress import Progress, check_stop
 from arview.quality import history
 
 if TYPE_CHECKING:

@@ -165,6 +165,12 @@ Examples:
     help="Folder of the inspections.",
 )
 @click.option(
+    "--archive",
+    type=click.FloatRange(min=0),
+    metavar="DAYS",
+    help="Put signed jobs DAYS old into FOLDER/archive.",
+)
+@click.option(
     "--devices",
     is_flag=True,
     is_eager=True,
@@ -215,6 +221,7 @@ def live(
     serial: str | None,
     max_age: float | None,
     jobs: str,
+    archive: float | None,
     size: tuple[int, int],
     fps: float,
     renderer: str,
@@ -233,7 +240,7 @@ def live(
     if (cert is None) != (key is None):
         raise InputError("--cert and --key belong together; give both or none")
     inputs = [*part_paths, views_path, *inspection_paths, camera_spec, source]
-    record_path = _record_path(record, inputs) if record else None
+    video = _record_path(record, inputs) if record else None
     options = station.LiveOptions(
         source=source,
         camera=camera_spec,
@@ -244,10 +251,10 @@ def live(
         serial=serial,
         max_age_s=max_age,
         guide=init.removeprefix("guide:") if init else None,
-        record=record_path,
-        record_folder=record_path.parent if record_path else Path(),
+        record=video,
+        record_folder=video.parent if video else Path(),
         recording=station.RecordingOptions(quota_bytes=round(1e9 * quota)),
-        jobs=station.JobOptions(folder=Path(jobs)),
+        jobs=station.JobOptions(folder=Path(jobs), archive_days=archive),
         width=size[0],
         height=size[1],
         fps=fps,
@@ -256,17 +263,11 @@ def live(
     _tell_logs()
     server = station.LiveServer(options, station.open_endpoint(host, port, is_plain, cert, key))
 
+    drawing = guideviews.GuideViewOptions(renderer=renderer)
+
     def load() -> station.Subjects:
         with progress_bar("guide views") as progress:
-            return station.load_subjects(
-                part_paths,
-                unit,
-                views_path,
-                options,
-                guideviews.GuideViewOptions(renderer=renderer),
-                progress,
-                instances,
-            )
+            return station.load_subjects(part_paths, unit, views_path, options, drawing, progress, instances)
 
     with _stopped_by_signals(server):
         asyncio.run(_serve(server, load))

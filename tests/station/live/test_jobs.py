@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
+import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -418,3 +420,29 @@ def newest(page: Http, client: str) -> dict[str, Any] | None:
     """*Pose* of the newest frame of a station camera, or None while there is none."""
     status, headers, _ = page.ask("GET", f"/api/clients/{client}/frame")
     return json.loads(headers["x-arview-answer"]) if status == 200 else None
+
+
+def test_the_list_reads_no_inspection_and_signed_jobs_are_archived(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    chosen = options(inspection=None, jobs=job_options(tmp_path))
+    with running(chosen, loader(chosen)) as server:
+        page = server.session()
+        signed, other = started(page, "BP-1"), started(page, "BP-2")
+        for job in (signed, other):
+            measured(on_disk(tmp_path, job))
+        with monkeypatch.context() as patch:
+            patch.setattr("arview.station.live.jobs.board.load_inspection", None)
+            states = [on_disk(tmp_path, job).state() for job in (signed, other)]
+            for job, state in zip((signed, other), states, strict=True):
+                on_disk(tmp_path, job).write_state(replace(state, verdict="fail"))
+            rows = page.json("GET", "/api/jobs")[1]["jobs"]
+            assert [one["verdict"] for one in rows] == ["fail", "fail"]
+        assert page.json("POST", f"/api/jobs/{signed}/sign", {"by": "Ada"})[0] == 201
+    old = time.time() - 40 * 86400
+    for path in (tmp_path / "jobs" / signed, tmp_path / "jobs" / signed / "decisions.jsonl"):
+        os.utime(path, (old, old))
+    chosen = options(inspection=None, jobs=replace(job_options(tmp_path), archive_days=30.0))
+    with running(chosen, loader(chosen)) as server:
+        assert [one["id"] for one in server.session().json("GET", "/api/jobs")[1]["jobs"]] == [other]
+    assert (tmp_path / "jobs" / "archive" / signed / "inspection.json").is_file()

@@ -12,6 +12,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
 import pytest
 
 from arview.cad import load_part
@@ -178,9 +180,8 @@ def test_quota_and_reserve_are_kept(part: Part, tmp_path: Path, monkeypatch: pyt
     job = new_job(part, tmp_path)
     full = uploads_of(job, tmp_path)
     with monkeypatch.context() as patched:
-        patched.setattr(uploads_module, "QUOTA_BYTES", 300_000)
+        patched.setattr(uploads_module, "QUOTA_BYTES", folder_bytes(tmp_path / "jobs") + 300_000)
         sent(full, photo(1))
-        assert folder_bytes(tmp_path / "jobs") > 150_000
         assert refused(lambda: sent(full, photo(2))).status == 507
     reserve = uploads_of(job, tmp_path, min_free_bytes=10**18)
     assert refused(lambda: reserve.begin(about(photo(3)))).code == "disk_full"
@@ -355,3 +356,22 @@ def test_announcements_that_a_crash_damaged_are_begun_again(part: Part, tmp_path
         name = sent(uploads_of(job, tmp_path), content)
         assert (job.path / "photos" / name).read_bytes() == content
     assert len(job.photos()) == len(damages)
+
+
+def test_pictures_that_show_nothing_or_are_cut_off_are_refused(part: Part, tmp_path: Path) -> None:
+    job = new_job(part, tmp_path)
+    uploads = uploads_of(job, tmp_path)
+    grey = np.full((600, 800, 3), 90, dtype=np.uint8)
+    png = cv2.imencode(".png", cv2.imdecode(np.frombuffer(photo(1), np.uint8), cv2.IMREAD_COLOR))[1].tobytes()
+    strip = cv2.imencode(".jpg", np.random.default_rng(1).integers(0, 255, (100, 1200, 3)).astype(np.uint8))[1]
+    cases = {
+        "cut off": [photo(1)[: len(photo(1)) // 2], png[: len(png) // 2]],
+        "one colour": [cv2.imencode(".jpg", grey)[1].tobytes(), cv2.imencode(".png", 0 * grey)[1].tobytes()],
+        "strip": [strip.tobytes()],
+    }
+    for reason, contents in cases.items():
+        for content in contents:
+            wrong = refused(lambda content=content: sent(uploads, content))  # type: ignore[misc]
+            assert wrong.code == "bad_photo" and reason in str(wrong), reason
+    assert job.photos() == () and uploads.listed() == []
+    assert sent(uploads, png).endswith(".png")

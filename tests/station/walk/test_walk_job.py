@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import shutil
 import subprocess
 import sys
 import threading
@@ -17,10 +18,13 @@ import pytest
 from arview.cad import Part, load_part
 from arview.errors import InputError, OutputError
 from arview.inspection import save_inspection
+from arview.quality import decisions
+from arview.station.walk.frozen_part import freeze_part
 from arview.station.walk.job import JobFolder, jobs_in
 from arview.station.walk.records import WalkState
 from helpers.cad_files import write_bench
 from helpers.inspections import deviation, inspection
+from helpers.paths import ROOT
 
 PART = '[part]\nname = "bench 4/2"\ncad = "bench.obj"\nunit = "mm"\n[components.plate]\nrole = "base"\n'
 POSE = np.eye(4).ravel().tolist()
@@ -256,3 +260,58 @@ def test_a_serial_number_is_needed(part: Part, tmp_path: Path) -> None:
     for serial in ("", "  ", "a" * 101, "a\nb"):
         with pytest.raises(InputError, match="serial number"):
             new_job(part, tmp_path, serial)
+
+
+def test_the_part_is_frozen_into_the_job(part: Part, tmp_path: Path) -> None:
+    source = tmp_path / "source"
+    shutil.copytree(ROOT / "samples" / "bracket_plate", source / "parts")
+    (source / "cad").mkdir()
+    text = (source / "parts" / "part.toml").read_text()
+    cad = load_part(source / "parts" / "part.toml").cad_path
+    shutil.move(cad, source / "cad" / cad.name)
+    (source / "parts" / "part.toml").write_text(text.replace(f'"{cad.name}"', f'"../cad/{cad.name}"'))
+    loaded = load_part(source / "parts" / "part.toml")
+    job = JobFolder.create(tmp_path / "jobs", loaded, loaded.path, "SN 1")
+    before = load_part(job.part_file)
+    assert before.model.source_hash == loaded.model.source_hash and job.path in job.part_file.parents
+    changed = (source / "parts" / "part.toml").read_text().replace("position_tolerance_mm", "angle_tolerance_deg")
+    (source / "parts" / "part.toml").write_text(changed)
+    shutil.rmtree(source / "cad")
+    after = load_part(JobFolder.open(job.path).part_file)
+    assert after.settings == before.settings and after.model.source_hash == loaded.model.source_hash
+
+
+def test_parts_of_a_gltf_and_a_step_in_files_beside_them_are_frozen(part: Part, tmp_path: Path) -> None:
+    (tmp_path / "sub").mkdir()
+    names = {"a.gltf": '{"buffers": [{"uri": "sub/a%20b.bin"}]}', "b.stp": "X('sub/post.stp','/etc/passwd','no.stp');"}
+    for name, text in {**names, "sub/a b.bin": "1", "sub/post.stp": "2"}.items():
+        (tmp_path / name).write_text(text)
+    for name, others in (("a.gltf", ["sub/a b.bin"]), ("b.stp", ["sub/post.stp"])):
+        job = tmp_path / f"job_{name}"
+        assert freeze_part(tmp_path / name, job) == f"part/{name}"
+        found = [path.relative_to(job / "part").as_posix() for path in (job / "part").rglob("*") if path.is_file()]
+        assert sorted(found) == sorted([name, *others])
+
+
+def test_a_copied_folder_is_a_job_of_its_own(part: Part, tmp_path: Path) -> None:
+    job = new_job(part, tmp_path)
+    add(job, 1)
+    shutil.copytree(job.path, job.path.with_name("copy"))
+    mine, copy = sorted(jobs_in(tmp_path / "jobs"), key=lambda one: one.id == "copy")
+    assert (mine.id, copy.id) == (job.id, "copy")
+    add(copy, 2)
+    assert len(mine.photos()) == 1 and len(copy.photos()) == 2
+
+
+def test_a_signed_job_is_not_reopened(part: Part, tmp_path: Path) -> None:
+    job = new_job(part, tmp_path)
+    add(job, 1)
+    job.end()
+    measured = inspection(part.model, (deviation("block", (0.0, 0.0, 0.0), np.array([30.0, 27.5, 12.5])),))
+    save_inspection(measured, job.path / "inspection.json")
+    job.write_state(WalkState("done"))
+    decisions.sign_inspection(job.path, "Ada")
+    assert job.is_signed
+    with pytest.raises(InputError, match="is signed"):
+        job.reopen()
+    assert job.is_ended

@@ -44,6 +44,7 @@ class JobOptions:
 
     folder: Path = Path("arview_jobs")  # made when the first inspection is started
     min_free_bytes: int = 500_000_000  # free disk space that is left to results and other programs
+    archive_days: float | None = None  # signed jobs unchanged for so long are moved to archive/; None: never
     workers: int = 1  # measurements that run at once; each uses both of two cores
 
 

@@ -19,7 +19,7 @@ from arview import reconstruction
 from arview.cad import Part
 from arview.camera import HEIF_SUFFIXES, PHOTO_SUFFIXES, Camera
 from arview.core.atomic import write_file
-from arview.core.stopping import until_stopped
+from arview.core.progress import until_stopped
 from arview.errors import OutputError
 from arview.pose import Pose
 from arview.station import capture

@@ -6,6 +6,7 @@
 | ``photos/`` | the photos as they were received |
 | ``photos.jsonl`` | a line for each photo, for the end of the walk, and for its reopening; append-only |
 | ``state.json`` | `WalkState`, written by the worker |
+| ``part/`` | the part file, its CAD and what they name, as they were when the job began |
 | ``rough/inspection.json`` | provisional numbers of the first photos |
 | ``recheck/NN/`` | jobs of single components measured again |
 | all else | what ``arview inspect`` writes |
@@ -36,6 +37,8 @@ from arview.core.atomic import replacing
 from arview.core.durable import append_durably, replace_durably, set_aside, sync_folder
 from arview.errors import InputError, OutputError
 from arview.inspection import Inspection, load_inspection
+from arview.quality import decisions
+from arview.station.walk.frozen_part import freeze_part
 from arview.station.walk.records import (
     PhotoOrigin,
     StoredPhoto,
@@ -98,6 +101,7 @@ class JobFolder:
             "version": VERSION,
             "id": job_id,
             "part": str(Path(part_path).resolve()),
+            "frozen_part": freeze_part(Path(part_path), folder),
             "part_name": part.name,
             "model_hash": part.model.source_hash,
             "serial": serial,
@@ -130,8 +134,15 @@ class JobFolder:
 
     @property
     def id(self) -> str:
-        """Name of the job, unique at its station."""
-        return str(self.document["id"])
+        """Name of the job, unique at its station: that of its folder, so that a copy is a job of its own."""
+        first = self.parent
+        return self.path.resolve().name if first is None else f"{first.id}_r{self.path.name}"
+
+    @property
+    def part_file(self) -> Path:
+        """The part file as it was when the job began; of a job of an older version the file itself."""
+        frozen = self.document.get("frozen_part")
+        return Path(str(self.document["part"])) if frozen is None else (self.parent or self).path / str(frozen)
 
     @property
     def serial(self) -> str:
@@ -229,7 +240,9 @@ class JobFolder:
         self._mark("end", lambda log: not log.is_ended)
 
     def reopen(self) -> None:
-        """More photos come after all."""
+        """More photos come after all. Raises InputError when the job is signed."""
+        if self.is_signed:
+            raise InputError(f"job {self.id}: is signed, and stays as it is; start a new inspection of {self.serial}")
         self._mark("reopened", lambda log: log.is_ended)
 
     def _mark(self, what: str, is_wanted: Any) -> None:
@@ -263,6 +276,11 @@ class JobFolder:
         with _WRITERS, file:
             fcntl.flock(file, fcntl.LOCK_EX)
             yield
+
+    @property
+    def is_signed(self) -> bool:
+        """Whether somebody has signed what was measured: nothing of it is changed any more."""
+        return any(entry.kind == "signature" for entry in decisions.log_of(self.path).entries())
 
     # --- state and results -------------------------------------------------------------------------------
 

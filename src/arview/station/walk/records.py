@@ -65,6 +65,7 @@ class WalkState:
         seconds_after_last_photo: time from the last photo or the end of the walk to the verdict; None before.
         cloud: state of the dense cloud, which follows the verdict.
         updated: when this was written, ISO 8601, UTC.
+        verdict: of the whole part; None before it, and in a job of an older version.
     """
 
     stage: WalkStage = "collecting"
@@ -79,6 +80,7 @@ class WalkState:
     seconds_after_last_photo: float | None = None
     cloud: CloudState = "waiting"
     updated: str = ""
+    verdict: str | None = None
 
     def document(self) -> dict[str, Any]:
         """The state for ``state.json``."""

@@ -19,8 +19,8 @@ from arview.cad import Part
 from arview.core.messages import sentence
 from arview.core.progress import Progress
 from arview.errors import ArviewError, InputError, MismatchError
-from arview.inspection import Inspection, save_inspection, verdict_sentence
-from arview.quality import decisions, history
+from arview.inspection import Inspection, overall_verdict, save_inspection, verdict_sentence
+from arview.quality import history
 from arview.station.walk.job import JobFolder
 from arview.station.walk.preparation import PhotoPreparation, photo_files, poses_of
 from arview.station.walk.records import WalkState
@@ -161,7 +161,7 @@ class WalkWorker:
             prepared, reconstruct=replace(prepared.reconstruct, known=reconstruction.KnownPairs(poses=poses_of(photos)))
         )
         was_done = self.state.stage == "done"
-        if was_done and any(one.kind == "signature" for one in decisions.log_of(self.job.path).entries()):
+        if was_done and self.job.is_signed:
             self._say(cloud="failed", text=f"{self.state.text}; no cloud: the job was signed without it", step="")
             return
         first: list[Inspection] = []
@@ -200,6 +200,7 @@ class WalkWorker:
         self._say(
             stage="done",
             text=verdict_sentence(inspection),
+            verdict=str(overall_verdict(inspection)),
             is_rough=False,
             inspection="inspection.json",
             placed=inspection.provenance.photos,
@@ -228,7 +229,8 @@ class WalkWorker:
         text = outcome.sentence
         if changed:
             text += f"; the cloud and the comparison of halves changed {', '.join(changed)}"
-        self._say(cloud="done", text=text, step="", done=0, total=0)
+        verdict = str(overall_verdict(outcome.inspection))
+        self._say(cloud="done", text=text, verdict=verdict, step="", done=0, total=0)
 
     def _add_to_history(self) -> None:
         """Add the result to the store of ``ARVIEW_STORE``, as ``arview history add`` does."""
@@ -267,7 +269,7 @@ def prepared_of(job: JobFolder) -> workflow.Prepared:
     document = job.document
     prepared = prepare(
         workflow.InspectJob(
-            str(document["part"]),
+            str(job.part_file),
             str(job.path / "photos"),
             serial=job.serial,
             camera=document.get("camera"),
@@ -276,7 +278,7 @@ def prepared_of(job: JobFolder) -> workflow.Prepared:
         job.path,
     )
     if prepared.part.model.source_hash != document["model_hash"]:
-        raise MismatchError(f"{document['part']}: has changed since job {job.id} was made; make a new job")
+        raise MismatchError(f"{job.part_file}: has changed since job {job.id} was made; make a new job")
     return prepared
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import threading
+import time
 from collections import OrderedDict
 from contextlib import suppress
 from pathlib import Path
@@ -54,6 +55,23 @@ class JobBoard:
             self._known = {job.id: job for job in found}
         return found
 
+    def archive(self) -> None:
+        """Move jobs that were signed, and then left alone for long enough, to ``archive/``, out of the list."""
+        folder, days = self.options.folder, self.options.archive_days
+        if days is None:
+            return
+        for job in self.jobs():
+            if job.components is not None or not job.is_signed:
+                continue
+            changed = max(job.path.stat().st_mtime, (job.path / "decisions.jsonl").stat().st_mtime)
+            if time.time() - changed > days * 86400.0:
+                try:
+                    (folder / "archive").mkdir(exist_ok=True)
+                    job.path.rename(folder / "archive" / job.path.name)
+                    logger.info("inspection %s is moved to %s", job.id, folder / "archive")
+                except OSError as error:
+                    logger.warning("inspection %s cannot be moved to the archive: %s", job.id, error)
+
     def find(self, job_id: str) -> walk.JobFolder:
         """The job of a name.
 
@@ -82,7 +100,11 @@ class JobBoard:
                 if is_of_it and job.components is None and job.state().stage in ("collecting", "measuring"):
                     return job, False
             if len(jobs) >= MAX_JOBS:
-                raise Refusal(507, "disk_full", f"the station holds {len(jobs)} inspections; move some")
+                raise Refusal(
+                    507,
+                    "disk_full",
+                    f"the station holds {len(jobs)} inspections; start arview live with --archive DAYS",
+                )
             self.space.check(0)
             try:
                 job = walk.JobFolder.create(self.options.folder, subject.part, subject.path or "", serial, camera)

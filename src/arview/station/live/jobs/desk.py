@@ -150,6 +150,7 @@ class JobDesk:
     def begin(self, subjects: Subjects) -> None:
         """Continue with the jobs of earlier runs, and drop what is left of old uploads."""
         self._subjects = subjects
+        self.board.archive()
         jobs = self.board.jobs()
         self.workers.resume(jobs)
         for job in jobs:
@@ -212,7 +213,7 @@ class JobDesk:
         """Number of the part that a job measures; None where it is not shown."""
         subjects, model = self._loaded(), job.document["model_hash"]
         fitting = [number for number, one in enumerate(subjects) if one.part.model.source_hash == model]
-        chosen = self._parts.get(job.id, self._parts.get(str(job.document.get("parent"))))
+        chosen = self._parts.get(job.id, self._parts.get((job.parent or job).id))
         return chosen if chosen in fitting else next(iter(fitting), None)
 
     def subject(self, job: walk.JobFolder) -> Subject | None:

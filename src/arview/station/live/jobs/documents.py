@@ -24,8 +24,10 @@ logger = logging.getLogger("arview.station.live")
 
 def job_row(job: walk.JobFolder, board: JobBoard, part: int | None) -> Document:
     """A job in the list."""
-    state, inspection = job.state(), board.inspection(job)
-    has_verdict = inspection is not None and not is_open(state)
+    state, photos = job.state(), job.photos()
+    verdict = state.verdict
+    if verdict is None and not is_open(state) and (inspection := board.inspection(job)) is not None:
+        verdict = str(overall_verdict(inspection))
     return {
         "id": job.id,
         "part": part,
@@ -33,9 +35,9 @@ def job_row(job: walk.JobFolder, board: JobBoard, part: int | None) -> Document:
         "serial": job.serial,
         "created": job.document["created"],
         "stage": state.stage,
-        "verdict": str(overall_verdict(inspection)) if inspection is not None and has_verdict else None,
-        "photos": len(job.photos()),
-        "parent": job.document.get("parent"),
+        "verdict": verdict,
+        "photos": len(photos),
+        "parent": None if job.parent is None else job.parent.id,
         "is_ended": job.is_ended,
     }
 
@@ -44,9 +46,12 @@ def job_document(job: walk.JobFolder, desk: JobDesk) -> Document:
     """A job with its state, photos, numbers, instructions and decisions."""
     board, number = desk.board, desk.part_of(job)
     inspection = board.inspection(job)
-    document = {key: value for key, value in job.document.items() if key not in ("format", "version", "part")}
+    document = {
+        key: value for key, value in job.document.items() if key not in ("format", "version", "part", "frozen_part")
+    }
     told: Document = {
         **document,
+        "id": job.id,
         "part": number,
         "state": job.state().document(),
         "is_ended": job.is_ended,

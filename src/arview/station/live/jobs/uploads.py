@@ -24,6 +24,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args
 
+import numpy as np
+
 from arview.camera import check_jpeg_scans
 from arview.core.atomic import write_file
 from arview.errors import InputError, OutputError
@@ -52,6 +54,9 @@ MEDIA_TYPES = ("image/jpeg", "image/png", "image/heic", "image/heif")
 Purpose = Literal["measure", "decide"]
 """What a photo is for: it is measured, or it shows what a person decides."""
 MIN_SIDE_PX = 64
+MAX_ASPECT = 4.0
+MAX_EMPTY_SPREAD = 4
+"""Grey levels between the darkest and the brightest place of a picture that shows nothing."""
 _SHA256 = re.compile(r"[0-9a-f]{64}")
 _NAME = re.compile(r"[0-9a-f]{32}")
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
@@ -378,10 +383,10 @@ def _name_of(sha256: str, purpose: Purpose) -> str:
 
 
 def check_photo(content: bytes, max_pixels: int) -> None:
-    """Check that a JPEG or PNG is one, by its header, before anything decodes it.
+    """Check that a JPEG or PNG is one: its header before anything decodes it, then that all of it is there.
 
     Raises:
-        InputError: it is damaged, too small or too large.
+        InputError: it is damaged, cut off, of one colour, a strip, too small or too large.
     """
     if content[4:8] == b"ftyp":  # HEIC is checked by who reads it
         return
@@ -392,10 +397,21 @@ def check_photo(content: bytes, max_pixels: int) -> None:
             (width, height), kind = header.size, header.format
     except (OSError, ValueError, SyntaxError, Pillow.DecompressionBombError) as error:
         raise InputError("this is no photo that can be read") from error
-    if min(width, height) < MIN_SIDE_PX or width * height > max_pixels:
-        raise InputError(f"the photo is {width}×{height} px; expected up to {max_pixels / 1e6:.0f} megapixels")
+    is_strip = max(width, height) > MAX_ASPECT * min(width, height)
+    if is_strip or min(width, height) < MIN_SIDE_PX or width * height > max_pixels:
+        raise InputError(
+            f"the photo is {width}×{height} px; expected up to {max_pixels / 1e6:.0f} megapixels, no strip"
+        )
     if kind == "JPEG":
         check_jpeg_scans(content)
+    try:
+        with Pillow.open(io.BytesIO(content), formats=["JPEG", "PNG"]) as picture:
+            picture.draft("L", (width // 8, height // 8))
+            levels = np.flatnonzero(picture.convert("L").histogram())
+    except (OSError, ValueError, SyntaxError) as error:
+        raise InputError("the photo is cut off or damaged; take it again") from error
+    if np.ptp(levels) <= MAX_EMPTY_SPREAD:
+        raise InputError("the photo shows nothing: all of it is of one colour; was the lens covered?")
 
 
 def free_bytes(folder: Path) -> int:

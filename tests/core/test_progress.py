@@ -15,13 +15,13 @@ from click.testing import CliRunner
 
 from arview.cli import ExitCode, main
 from arview.core.atomic import begin_unfinished, replacing, unfinished_path
-from arview.core.stopping import check_stop, stops_by_signals, until_stopped
+from arview.core.progress import check_stop, stops_by_signals, until_stopped
 
 KERNEL = """
 import sys, time
 from typing import NamedTuple
 import numba
-from arview.core.stopping import until_stopped
+from arview.core.progress import until_stopped
 
 class Pair(NamedTuple):
     a: float
