@@ -72,6 +72,20 @@ def test_new_connections_of_one_address_are_rated_and_authenticated_are_counted(
     assert len(closed) == 6 and table.authenticated == table.unauthenticated == 0
 
 
+def test_no_device_locks_out_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    limit(monkeypatch, HANDSHAKES_BURST=1e6, MAX_AUTHENTICATED=10, PER_DEVICE=4)
+    table = ConnectionTable()
+    closed: list[tuple[str, int]] = []
+    admitted(table, "a", range(20), closed)
+    for port in range(20):
+        table.show_token(("a", port), "iPhone")
+    assert table.authenticated == 4 and closed == [("a", port) for port in range(16)]
+    admitted(table, "b", range(3), closed)
+    for port in range(3):
+        table.show_token(("b", port), "iPad")
+    assert table.authenticated == 7 and len(closed) == 16
+
+
 @contextmanager
 def https_server(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[LiveServer]:
     monkeypatch.setenv("ARVIEW_DATA", str(folder))

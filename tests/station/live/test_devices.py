@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from typing import Any
 
 import pytest
 from click.testing import CliRunner
@@ -74,6 +75,26 @@ def test_devices_that_are_not_used_are_forgotten(tmp_path: Path) -> None:
     later = Devices(path)
     later.save()
     assert later.find(new) == "iPad" and later.find(old) is None
+
+
+def test_a_clock_put_forward_forgets_nobody(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    devices = Devices(tmp_path / "devices.json")
+    (_, phone), (_, tablet) = devices.pair("iPhone"), devices.pair("iPad")
+
+    class Later(datetime):
+        @classmethod
+        def now(cls, tz: Any = None) -> datetime:
+            return datetime.now(tz) + timedelta(days=3650)
+
+    with monkeypatch.context() as patch:
+        patch.setattr("arview.station.live.security.devices.datetime", Later)
+        assert devices.find(phone) == "iPhone"
+        devices.save()
+        assert devices.find(tablet) == "iPad"
+    assert devices.find(phone) == "iPhone"
+    devices.save()
+    again = Devices(tmp_path / "devices.json")
+    assert again.find(phone) == "iPhone" and again.find(tablet) == "iPad"
 
 
 def test_two_processes_share_the_file_and_a_revoked_device_does_not_come_back(tmp_path: Path) -> None:

@@ -106,6 +106,15 @@ def test_leaf_is_renewed_when_it_ends_soon_or_the_address_changes_and_the_author
     assert later.is_authority_new and later.authority_der != first.authority_der
 
 
+@pytest.mark.parametrize("years", [-10, 10])
+def test_what_was_made_by_a_wrong_clock_is_replaced(tmp_path: Path, years: int) -> None:
+    wrong = local_certificates(HERE, tmp_path, NOW + timedelta(days=365 * years))
+    right = local_certificates(HERE, tmp_path, NOW)
+    assert right.is_authority_new and right.authority_der != wrong.authority_der
+    assert leaf(tmp_path).not_valid_before_utc <= NOW <= leaf(tmp_path).not_valid_after_utc
+    assert not local_certificates(HERE, tmp_path, NOW).is_authority_new
+
+
 @pytest.mark.parametrize("name", ["authority.pem", "authority.key", "server.pem", "server.key"])
 @pytest.mark.parametrize("damage", ["gone", "garbage", "empty"])
 def test_damaged_files_are_made_anew(tmp_path: Path, name: str, damage: str) -> None:

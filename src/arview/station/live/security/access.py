@@ -149,7 +149,7 @@ class Gate:
                 raise
             self._rate.check(str(address))
             if self._connections is not None:
-                self._connections.show_token((str(address), int(port)))
+                self._connections.show_token((str(address), int(port)), scope.get(DEVICE) or str(address))
             self._check_origin(scope, headers)
         except Refusal as refusal:
             await self._refused(scope, refusal)(scope, receive, send_with_headers)

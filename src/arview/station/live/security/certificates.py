@@ -109,7 +109,7 @@ def local_certificates(
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)
         folder.chmod(0o700)
         authority = _load(folder / _AUTHORITY, folder / _AUTHORITY_KEY)
-        is_new = authority is None or _days_left(authority[0], now) < AUTHORITY_RENEWAL_DAYS
+        is_new = authority is None or not _is_valid(authority[0], now, AUTHORITY_RENEWAL_DAYS)
         if authority is None or is_new:
             authority = _make_authority(now, AUTHORITY_DAYS)
             _save(folder / _AUTHORITY, folder / _AUTHORITY_KEY, [authority[0]], authority[1])
@@ -139,8 +139,9 @@ def _is_permitted(address: str) -> bool:
     return any(parsed in ipaddress.ip_network(network) for network in PRIVATE_NETWORKS)
 
 
-def _days_left(certificate: x509.Certificate, now: datetime) -> float:
-    return (certificate.not_valid_after_utc - now) / timedelta(days=1)
+def _is_valid(certificate: x509.Certificate, now: datetime, days: float) -> bool:
+    """Whether a certificate is valid now, also where the clock was put back, and for some days to come."""
+    return certificate.not_valid_before_utc <= now <= certificate.not_valid_after_utc - timedelta(days=days)
 
 
 def _common_name(certificate: x509.Certificate) -> str:
@@ -254,7 +255,7 @@ def _is_good(
     except (InvalidSignature, ValueError, TypeError, x509.ExtensionNotFound):
         return False
     covered = all(_general_name(address) in list(names) for address in addresses)
-    return covered and leaf.not_valid_before_utc <= now and _days_left(leaf, now) >= min_days
+    return covered and _is_valid(leaf, now, min_days)
 
 
 def _load(certificate_path: Path, key_path: Path) -> _Pair | None:

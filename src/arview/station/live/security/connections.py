@@ -13,6 +13,8 @@ MAX_UNAUTHENTICATED = 256
 """Connections of all addresses that have not shown the token."""
 MAX_AUTHENTICATED = 256
 """Connections that have shown the token."""
+PER_DEVICE = 48
+"""Connections of one device; one more takes the place of its oldest, so that no device locks out others."""
 HANDSHAKES_PER_S = 30.0
 """New connections of one address per second: about a tenth of a core at most."""
 HANDSHAKES_BURST = 300.0
@@ -25,15 +27,15 @@ Peer = tuple[str, int]
 class ConnectionTable:
     """The open connections of a server.
 
-    A connection is unauthenticated until a request on it has shown the token; then it is authenticated and never closed
-    for others. An unauthenticated one too many makes room by closing the oldest one of its address, or of the address
-    that has the most: an address that holds many idle connections thus stops neither others nor itself, and phones that
-    share one address behind a router can still join.
+    A connection is unauthenticated until a request on it has shown the token; then it is authenticated, and closed for
+    newer ones of the same device only. An unauthenticated one too many makes room by closing the oldest one of its
+    address, or of the address that has the most: an address that holds many idle connections thus stops neither others
+    nor itself, and phones that share one address behind a router can still join.
     """
 
     def __init__(self) -> None:
         self._rate = RateLimit(HANDSHAKES_PER_S, HANDSHAKES_BURST)
-        self._authenticated: dict[Peer, Callable[[], None]] = {}
+        self._authenticated: dict[Peer, tuple[str, Callable[[], None]]] = {}
         self._unauthenticated: dict[str, dict[Peer, Callable[[], None]]] = {}
 
     def admit(self, peer: Peer, close: Callable[[], None]) -> bool:
@@ -53,8 +55,8 @@ class ConnectionTable:
         self._unauthenticated.setdefault(address, {})[peer] = close
         return True
 
-    def show_token(self, peer: Peer) -> None:
-        """Note that a request of this connection has shown the token.
+    def show_token(self, peer: Peer, device: str = "") -> None:
+        """Note that a request of this connection has shown the token of a device.
 
         Raises:
             Refusal: 503, when too many connections have.
@@ -62,10 +64,15 @@ class ConnectionTable:
         close = self._unauthenticated.get(peer[0], {}).get(peer)
         if close is None:  # noted before, or closed meanwhile
             return
+        own = [one for one, (name, _) in self._authenticated.items() if name == device]
+        if len(own) >= PER_DEVICE:
+            close_oldest = self._authenticated[own[0]][1]
+            self.remove(own[0])
+            close_oldest()
         if len(self._authenticated) >= MAX_AUTHENTICATED:
             raise Refusal(503, "busy", "busy: too many connections", {"Retry-After": "5", "Connection": "close"})
         self.remove(peer)
-        self._authenticated[peer] = close
+        self._authenticated[peer] = device, close
 
     def remove(self, peer: Peer) -> None:
         """Forget a connection that has ended."""
@@ -89,7 +96,7 @@ class ConnectionTable:
     def close_all(self) -> None:
         """Close the connections that are still open."""
         for peer, close in [
-            *self._authenticated.items(),
+            *((peer, close) for peer, (_, close) in self._authenticated.items()),
             *(one for of in self._unauthenticated.values() for one in of.items()),
         ]:
             self.remove(peer)

@@ -50,6 +50,8 @@ MAX_DEVICES = 64
 """Paired devices; one more takes the place of the one that was not used for the longest time."""
 UNUSED_DAYS = 180.0
 """A device that is not used for so long is forgotten."""
+JUMP = timedelta(days=7)
+"""After so long without any device the station was off, or its clock was put forward: neither counts as not used."""
 SAVE_INTERVAL_S = 600.0
 """Times of last use are written at most once in this time."""
 
@@ -111,7 +113,11 @@ class Devices:
                     found = device
             if found is None:
                 return None
-            self._devices[found.token_hash] = replace(found, last_used=datetime.now(UTC))
+            now = datetime.now(UTC)
+            gap = now - max(device.last_used for device in self._devices.values())
+            if gap > JUMP:
+                self._devices = {key: replace(one, last_used=one.last_used + gap) for key, one in self._devices.items()}
+            self._devices[found.token_hash] = replace(found, last_used=now)
             return found.name
 
     def has(self, name: str) -> bool:

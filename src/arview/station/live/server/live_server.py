@@ -5,10 +5,13 @@ from __future__ import annotations
 import asyncio
 import logging
 import socket
+import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+
+from starlette.types import Receive, Scope, Send
 
 from arview.errors import InputError
 from arview.station.live.options import LiveOptions
@@ -31,6 +34,8 @@ from arview.station.live.transport.webrtc import raise_bitrates
 
 RENEWAL_INTERVAL_S = 12 * 3600.0
 """Time between two checks of the age of the certificate."""
+CLOCK_INTERVAL_S, CLOCK_JUMP_S = 20.0, 3600.0
+"""Time between two looks at the clock, and by how much it must have been put for a check at once."""
 WORKER_TIMEOUT_S = 30.0
 """A thread for drawing, JPEG or files that takes longer is given up and replaced."""
 WORKERS = 16
@@ -156,7 +161,12 @@ class LiveServer:
         app = make_app(hub, self.access, connections)
         servers = [UvicornServer(app, place.listener, place.certificates, connections)]
         if self.endpoint.trust_listener is not None and self.endpoint.certificates is not None:
-            servers.append(UvicornServer(trust_app(self.endpoint.certificates), self.endpoint.trust_listener))
+            self._trust = trust_app(self.endpoint.certificates)
+
+            async def serve_trust(scope: Scope, receive: Receive, send: Send) -> None:
+                await self._trust(scope, receive, send)
+
+            servers.append(UvicornServer(serve_trust, self.endpoint.trust_listener))
         stopped = asyncio.ensure_future(self._stop.wait())
         tasks = [asyncio.ensure_future(server.run_until_stopped()) for server in servers]
         tasks.append(asyncio.ensure_future(self._renew(servers[0])))
@@ -182,12 +192,23 @@ class LiveServer:
             await asyncio.gather(*tasks, return_exceptions=True)
 
     async def _renew(self, server: UvicornServer) -> None:
-        """Renew the certificate of a server that runs for months."""
+        """Renew the certificate of a server that runs for months, or whose clock is put right while it runs."""
+        ahead_s, due_s = time.time() - time.monotonic(), time.monotonic() + RENEWAL_INTERVAL_S
         while True:
-            await asyncio.sleep(RENEWAL_INTERVAL_S)
-            if self.endpoint.trust_listener is None:
+            await asyncio.sleep(CLOCK_INTERVAL_S)
+            now_s = time.time() - time.monotonic()
+            is_due = abs(now_s - ahead_s) > CLOCK_JUMP_S or time.monotonic() > due_s
+            if not is_due or self.endpoint.trust_listener is None:
                 continue
+            ahead_s, due_s = now_s, time.monotonic() + RENEWAL_INTERVAL_S
             try:
-                server.renew(await asyncio.to_thread(local_certificates, self.endpoint.addresses))
+                made = await asyncio.to_thread(local_certificates, self.endpoint.addresses)
+                server.renew(made)
+                if made.is_authority_new:
+                    self._trust = trust_app(made)
+                    logger.warning(
+                        "the clock was put right, so there is a new certificate: phones have to trust it at %s",
+                        self.endpoint.trust_link,
+                    )
             except Exception as error:  # the current certificate stays valid for weeks
                 logger.warning("the certificate could not be renewed: %s", error)
