@@ -1,8 +1,8 @@
 """Exact closest points on a triangle mesh, for registering and comparing clouds.
 
-A tree of boxes is searched from near to far; the closest point of a triangle follows from the regions of its plane
-(Ericson, Real-Time Collision Detection, 2005, 5.1.5), and the side of the surface from angle-weighted normals of edges
-and corners (Bærentzen & Aanæs, TVCG 2005).
+The boxes that `arview.rendering.RayCaster` builds are searched from near to far; the closest point of a triangle
+follows from the regions of its plane (Ericson, Real-Time Collision Detection, 2005, 5.1.5), and the side of the surface
+from angle-weighted normals of edges and corners (Bærentzen & Aanæs, TVCG 2005).
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from arview.core.kernel import kernel
 from arview.errors import InputError
 from arview.geometry import Array
+from arview.rendering import RayCaster
 
 _LEAF = 4
 """Triangles in a leaf of the tree."""
@@ -78,7 +79,8 @@ class MeshSurface:
             raise InputError("surface: no triangle has an area")
         self.face_normals = normals / np.maximum(doubled, 1e-300)[:, None]
         side_normals, is_edge, corner_normals = self._neighbourhood(used)
-        self._order, self._low, self._high, self._right, self._start, self._count = _tree(self.triangles, used)
+        tree = RayCaster(self.vertices, self.faces[used], _LEAF).hierarchy
+        self._bounds, self._links, self._order = tree.bounds, tree.links, used[tree.order]
         self._triangles = np.ascontiguousarray(self.triangles[self._order])
         self._sides = np.ascontiguousarray(side_normals[self._order])
         self._is_edge = np.ascontiguousarray(is_edge[self._order])
@@ -112,11 +114,8 @@ class MeshSurface:
                 sides=self._sides,
                 edges=self._is_edge,
                 corner_normals=self._corner_normals,
-                low=self._low,
-                high=self._high,
-                right=self._right,
-                start=self._start,
-                count=self._count,
+                bounds=self._bounds,
+                links=self._links,
                 order=self._order,
                 out_points=out.points[part],
                 out_faces=out.faces[part],
@@ -221,82 +220,12 @@ def _smooth(
     return out
 
 
-@kernel
-def _build(
-    middles: NDArray[np.float64],
-    lows: NDArray[np.float64],
-    highs: NDArray[np.float64],
-    order: NDArray[np.int64],
-    low: NDArray[np.float64],
-    high: NDArray[np.float64],
-    right: NDArray[np.int64],
-    start: NDArray[np.int64],
-    count: NDArray[np.int64],
-) -> int:
-    """Boxes of a tree in depth-first order, the left child right after its parent; returns their number."""
-    stack = np.empty((128, 3), dtype=np.int64)
-    stack[0] = 0, len(order), -1
-    top, nodes = 1, 0
-    while top > 0:
-        top -= 1
-        first, last, parent = stack[top]
-        node = nodes
-        nodes += 1
-        if parent >= 0:
-            right[parent] = node
-        middle_low, middle_high = np.full(3, np.inf), np.full(3, -np.inf)
-        low[node], high[node] = np.inf, -np.inf
-        for i in range(first, last):
-            for axis in range(3):
-                low[node, axis] = min(low[node, axis], lows[order[i], axis])
-                high[node, axis] = max(high[node, axis], highs[order[i], axis])
-                middle_low[axis] = min(middle_low[axis], middles[order[i], axis])
-                middle_high[axis] = max(middle_high[axis], middles[order[i], axis])
-        right[node], start[node], count[node] = -1, first, last - first
-        if last - first <= _LEAF:
-            continue
-        axis = int(np.argmax(middle_high - middle_low))
-        at = 0.5 * (middle_low[axis] + middle_high[axis])
-        split = first
-        for i in range(first, last):
-            if middles[order[i], axis] < at:
-                order[i], order[split] = order[split], order[i]
-                split += 1
-        if split - first < (last - first) // 16 or last - split < (last - first) // 16 or split in (first, last):
-            part = order[first:last].copy()
-            order[first:last] = part[np.argsort(middles[part, axis])]
-            split = (first + last) // 2
-        count[node] = 0
-        # The left part is next, so that it follows its parent; the right one sets its parent's index later.
-        stack[top] = split, last, node
-        stack[top + 1] = first, split, -1
-        top += 2
-    return nodes
-
-
-def _tree(triangles: Array, used: NDArray[np.int64]) -> tuple[NDArray, ...]:  # type: ignore[type-arg]
-    """Tree over the triangles in use.
-
-    Returns:
-        order of the triangles, and for each node its lowest and highest corner, right child, first triangle and number
-        of triangles.
-    """
-    lows, highs = triangles.min(axis=1), triangles.max(axis=1)
-    order, size = used.copy(), 2 * len(used)
-    low, high = np.empty((size, 3)), np.empty((size, 3))
-    right, start, count = (np.empty(size, dtype=np.int64) for _ in range(3))
-    nodes = _build(
-        triangles.mean(axis=1), lows, highs, order=order, low=low, high=high, right=right, start=start, count=count
-    )
-    return order, low[:nodes].copy(), high[:nodes].copy(), right[:nodes], start[:nodes], count[:nodes]
-
-
 @kernel(inline=True)
-def _to_box(x: Any, y: Any, z: Any, low: Any, high: Any) -> Any:
-    """Squared distance of a point to a box."""
-    dx = max(low[0] - x, 0.0, x - high[0])
-    dy = max(low[1] - y, 0.0, y - high[1])
-    dz = max(low[2] - z, 0.0, z - high[2])
+def _to_box(x: Any, y: Any, z: Any, box: Any) -> Any:
+    """Squared distance of a point to a box, low xyz and high xyz."""
+    dx = max(box[0] - x, 0.0, x - box[3])
+    dy = max(box[1] - y, 0.0, y - box[4])
+    dz = max(box[2] - z, 0.0, z - box[5])
     return dx * dx + dy * dy + dz * dz
 
 
@@ -338,8 +267,8 @@ def _on_triangle(px: float, py: float, pz: float, t: NDArray[np.float64]) -> tup
 def _query(
     points: NDArray[np.float64], hints: NDArray[np.int64], reach2: float, triangles: NDArray[np.float64],
     sides: NDArray[np.float64], edges: NDArray[np.bool_], corner_normals: NDArray[np.float64],
-    low: NDArray[np.float64], high: NDArray[np.float64], right: NDArray[np.int64], start: NDArray[np.int64],
-    count: NDArray[np.int64], order: NDArray[np.int64], out_points: NDArray[np.float64], out_faces: NDArray[np.int64],
+    bounds: NDArray[np.float64], links: NDArray[np.int32], order: NDArray[np.int64],
+    out_points: NDArray[np.float64], out_faces: NDArray[np.int64],
     out_distances: NDArray[np.float64], out_normals: NDArray[np.float64], out_edges: NDArray[np.bool_]
 ) -> None:  # fmt: skip
     """Closest points of a chunk of points, written into the arrays ``out_…``; see `ClosestPoints`."""
@@ -351,7 +280,7 @@ def _query(
         q1 = q2 = 0.0
         top = 0
         hint = hints[i]
-        stack[0], near[0] = 0, _to_box(x, y, z, low[0], high[0])
+        stack[0], near[0] = 0, _to_box(x, y, z, bounds[0])
         top = 1
         while top > 0 or hint >= 0:
             if hint >= 0:
@@ -361,9 +290,9 @@ def _query(
                 node = stack[top]
                 if not near[top] < best:
                     continue
-                if count[node] == 0:
-                    a, b = node + 1, right[node]
-                    da, db = _to_box(x, y, z, low[a], high[a]), _to_box(x, y, z, low[b], high[b])
+                if links[node, 1] == 0:
+                    a, b = np.int64(links[node, 0]), np.int64(links[node, 0] + 1)
+                    da, db = _to_box(x, y, z, bounds[a]), _to_box(x, y, z, bounds[b])
                     if da > db:
                         a, b, da, db = b, a, db, da
                     if db < best:
@@ -373,7 +302,7 @@ def _query(
                         stack[top], near[top] = a, da
                         top += 1
                     continue
-                first, last = start[node], start[node] + count[node]
+                first, last = np.int64(links[node, 0]), np.int64(links[node, 0] + links[node, 1])
             for k in range(first, last):
                 t = triangles[k]
                 v, w, place = _on_triangle(x, y, z, t)
