@@ -222,15 +222,34 @@ def test_the_command_compares(found: Inspection, tmp_path: Path) -> None:
     source = tmp_path / "inspection.json"
     save_inspection(found, source)
     path = _list(tmp_path, found, {"block_1": (0.02, 0.0, 0.0), "block_2": (0.0, 0.2, 0.0)})
-    done = CliRunner().invoke(main, ["verify", str(source), str(path), "-o", str(tmp_path / "e.json")])
+    done = CliRunner().invoke(main, ["compare", str(path), str(tmp_path), "-o", str(tmp_path / "e.json")])
     assert done.exit_code == 1, done.output
-    assert "E_n ≤ 1 for 1 of 2 components" in done.output
+    assert "E_n ≤ 1 for 1 of 2 compared components; 2 were" in done.output
     assert next(line for line in done.output.splitlines() if line.startswith("block_2")).endswith("differs")
     record = json.loads((tmp_path / "e.json").read_text(encoding="utf-8"))
     assert [one["name"] for one in record["components"]] == ["block_1", "block_2"]
     refused = CliRunner().invoke(main, ["verify", str(source), str(path), "--mpe", "0.1"])
     assert refused.exit_code == 64
-    assert "lists components, not lengths" in refused.output
+    assert "lists places of components, not lengths; use arview compare" in refused.output
+    # What was not compared is not agreed on.
+    lines = path.read_text(encoding="utf-8").splitlines()
+    path.write_text("\n".join(line for line in lines if not line.startswith("block_2")), encoding="utf-8")
+    part = CliRunner().invoke(main, ["compare", str(path), str(tmp_path)])
+    assert part.exit_code == 2 and "1 of 1 compared components; 3 were not compared" in part.output
+
+
+def test_positions_and_deviations_that_contradict_each_other_are_refused(found: Inspection, tmp_path: Path) -> None:
+    save_inspection(found, tmp_path / "inspection.json")
+    one = found.components[0]
+    assert one.details is not None
+    nominal, moved = np.array(one.details.center_mm), np.array(one.displacement_mm)
+    cases = ((nominal + moved, 2), (nominal, 2), (nominal + moved + [0.0, 0.3, 0.0], 64))  # measured, nominal, neither
+    for place, code in cases:
+        row = ",".join(f"{value:.4f}" for value in (*place, *moved))
+        (tmp_path / "l.csv").write_text(f"name,x,y,z,dx,dy,dz,U\n{one.name},{row},0.1\n", encoding="utf-8")
+        done = CliRunner().invoke(main, ["compare", str(tmp_path / "l.csv"), str(tmp_path)])
+        assert done.exit_code == code, done.output
+    assert "contradict each other by 0.300 mm" in done.output
 
 
 # ---- an inspection made by hand
@@ -290,8 +309,8 @@ def test_the_command_compare(found: Inspection, tmp_path: Path) -> None:
     assert alone.exit_code == 64 and "holds no inspection.json" in alone.output
     save_inspection(found, tmp_path / "inspection.json")
     result = CliRunner().invoke(main, ["compare", str(path), "-o", str(tmp_path / "out.json")])
-    assert result.exit_code == 0, result.output
-    assert "E_n ≤ 1 for 2 of 2 components" in result.output
+    assert result.exit_code == 2, result.output
+    assert "E_n ≤ 1 for 2 of 2 compared components; 2 were not compared" in result.output
     record = json.loads((tmp_path / "out.json").read_text(encoding="utf-8"))
     assert [one["name"] for one in record["components"]] == ["block_1", "block_2"]
     _list(tmp_path, found, {"block_1": (0.5, 0.0, 0.0)})

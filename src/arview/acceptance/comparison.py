@@ -20,6 +20,8 @@ from arview.errors import InputError
 from arview.geometry import Array
 from arview.inspection import ComponentDeviation, Finding, Inspection
 
+MAX_CONTRADICTION_MM = 0.02
+"""Difference of positions and deviations in one list that rounding explains."""
 _MIN_U_MM = 1e-9
 """A smaller U of both together is none: E_n would be without bound."""
 
@@ -142,6 +144,10 @@ def _compare(one: ComponentDeviation, line: ListedComponent, center: Array | Non
     if one.finding is Finding.MISSING:
         return "is missing by the inspection"
     theirs = line.displacement
+    moved = np.zeros(3) if center is None else np.nan_to_num(line.place - center)  # none where x, y, z are nominal
+    gap = np.abs(np.nan_to_num(moved - theirs)).max()
+    if np.abs(moved).max() > MAX_CONTRADICTION_MM and gap > MAX_CONTRADICTION_MM:
+        raise InputError(f"{one.name}: x, y, z and dx, dy, dz of the list contradict each other by {gap:.3f} mm")
     if np.isnan(theirs).all():
         if center is None:
             return "the inspection has no nominal position of the listed point; give --part, or list dx, dy, dz"

@@ -18,6 +18,7 @@ from arview.cli.common import (
     UNIT,
     camera_for,
     check_profile,
+    inspection_file,
     likely_cause,
     load_pose,
     main,
@@ -112,8 +113,9 @@ Examples:
     "--inspection",
     "inspection_paths",
     multiple=True,
-    metavar="FILE",
-    help="inspection.json to draw; again for further specimens.",
+    callback=inspection_file,
+    metavar="JOB",
+    help="Job folder or inspection.json; again for further specimens.",
 )
 @click.option("-o", "--output", metavar="OUT.mp4", help="Annotated video.")
 @click.option("--poses", "poses_path", metavar="OUT.jsonl", help="Pose of every frame.")

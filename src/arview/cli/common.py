@@ -303,6 +303,13 @@ MODALITY = click.option(
 )
 
 
+def inspection_file(ctx: click.Context, parameter: click.Parameter, value: Any) -> Any:
+    """The inspection.json of each folder among the given paths; files as they are."""
+    if isinstance(value, tuple):
+        return tuple(inspection_file(ctx, parameter, one) for one in value)
+    return str(Path(value) / "inspection.json") if value is not None and Path(value).is_dir() else value
+
+
 def session_options(modalities: tuple[str, ...]) -> tracking.SessionOptions:
     """Options of a tracking session that uses these modalities."""
     return tracking.SessionOptions(

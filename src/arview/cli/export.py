@@ -9,7 +9,7 @@ from pathlib import Path
 import click
 
 from arview import acceptance
-from arview.cli.common import UNIT, main, output_path, say
+from arview.cli.common import UNIT, inspection_file, main, output_path, say
 from arview.core.atomic import write_file
 from arview.core.extras import require
 from arview.core.plug_ins import find_plug_ins, load_plug_in
@@ -55,7 +55,7 @@ to two significant digits; inspection.json keeps every digit. Each carries the f
 inspection that report and results store show. The fields of inspection.json are described in
 src/arview/inspection/schema/inspection-json.md and by the JSON Schema next to it.""",
 )
-@click.argument("inspection", metavar="INSPECTION")
+@click.argument("inspection", metavar="INSPECTION", callback=inspection_file)
 @click.option(
     "--to",
     "formats",

@@ -16,7 +16,17 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from arview import guideviews
-from arview.cli.common import RENDERER, UNIT, check_profile, main, output_path, progress_bar, refuse_for_several, say
+from arview.cli.common import (
+    RENDERER,
+    UNIT,
+    check_profile,
+    inspection_file,
+    main,
+    output_path,
+    progress_bar,
+    refuse_for_several,
+    say,
+)
 from arview.cli.exit_codes import ExitCode
 from arview.core.extras import require, require_extra
 from arview.errors import InputError, MissingDependencyError
@@ -92,7 +102,6 @@ def _revoke_devices(names: tuple[str, ...]) -> None:
 Examples:
   arview live --part part.toml --inspection inspection.json
   arview live --part part.toml --inspection inspection.json --camera phone.json --record session.mp4
-  arview live --part part.toml --source 0 --camera webcam.json
   arview live --part part.toml --source rtsp://camera.local/1 --camera station.json
   arview live --part part.toml --source clip.mp4 --camera camera.json --http
   Notes: docs/reference/command-notes.md""",
@@ -112,8 +121,9 @@ Examples:
     "--inspection",
     "inspection_paths",
     multiple=True,
-    metavar="FILE",
-    help="inspection.json to show; again for further specimens.",
+    callback=inspection_file,
+    metavar="JOB",
+    help="Job folder or inspection.json; again for others.",
 )
 @click.option("--source", default="phone", show_default=True, metavar="SOURCE", help="Camera or video to show.")
 @click.option("--camera", "camera_spec", metavar="CAMERA", help="Camera file or fov:DEG.")

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import click
 
-from arview.cli.common import UNIT, main, output_path, say, stage_bar
+from arview.cli.common import UNIT, inspection_file, main, output_path, say, stage_bar
 from arview.cli.exit_codes import ExitCode
 from arview.core.atomic import write_file
 from arview.errors import InputError, MissingDependencyError, OutputError
@@ -35,7 +35,7 @@ the 3D view, and the inspection as an attachment.
 Pictures are made from the photos in the folder of `arview reconstruct` (default: that of INSPECTION), and
 need --part. Whatever is not available is left out, and the report says so.""",
 )
-@click.argument("inspection", metavar="INSPECTION")
+@click.argument("inspection", metavar="INSPECTION", callback=inspection_file)
 @click.option("-o", "--output", metavar="HTML", help="Page to write; default: report.html next to INSPECTION.")
 @click.option("--pdf", metavar="PDF", help="Also write a PDF.")
 @click.option("--part", "part_path", metavar="PART", help="Part file or CAD file that was measured against.")
@@ -57,7 +57,7 @@ def report(
 
     source = Path(inspection)
     if not source.is_file():
-        raise InputError(f"{source}: no such file; give the inspection.json that `arview measure` wrote")
+        raise InputError(f"{source}: no such file; give a job folder, or an inspection.json")
     inputs = [source, part_path]
     html = output_path(output or str(source.parent / "report.html"), inputs)
     paper = None if pdf is None else output_path(pdf, [*inputs, html])
@@ -92,9 +92,10 @@ displacement magnified, with the tolerance zone.""",
     exit_codes={
         ExitCode.DONE: "nothing is out of tolerance",
         ExitCode.FAIL: "there is rework to do",
+        ExitCode.UNDECIDED: "no rework is known, but a component is undecided or was not measured",
     },
 )
-@click.argument("inspection", metavar="INSPECTION")
+@click.argument("inspection", metavar="INSPECTION", callback=inspection_file)
 @click.option(
     "--part", "part_path", metavar="PART", required=True, help="Part file or CAD file that was measured against."
 )
@@ -104,7 +105,7 @@ displacement magnified, with the tolerance zone.""",
 def rework(inspection: str, part_path: str, output: str | None, as_json: bool, unit: str | None) -> None:
     """Say what to do about the components of INSPECTION that are out of tolerance."""
     from arview.cad import load_part
-    from arview.inspection import load_inspection
+    from arview.inspection import Verdict, load_inspection
     from arview.quality.rework import drawing_svg, instruction_document, make_instructions
 
     part = load_part(part_path, unit)
@@ -120,15 +121,18 @@ def rework(inspection: str, part_path: str, output: str | None, as_json: bool, u
                 click.echo(f"  {text}")
         for number, step in enumerate(one.steps, 1):
             click.echo(f"  {number}. {step}")
+    open_names = [one.name for one in loaded.components if one.verdict in (Verdict.NOT_MEASURED, Verdict.UNDECIDED)]
     if not found and not as_json:
-        click.echo("nothing is out of tolerance: no rework")
+        click.echo("nothing is known to be out of tolerance: no rework")
+    if open_names:
+        say(f"not measured or undecided, so it is not known whether they need rework: {', '.join(open_names)}")
     if folder is not None:
         for one in found:
             # Names of components may hold what a file name may not.
             target = folder / f"{re.sub(r'[^A-Za-z0-9._-]+', '_', one.component).lstrip('.') or 'component'}.svg"
             write_file(target, drawing_svg(part, loaded, one.component).encode("utf-8"))
             say(f"wrote {target}")
-    click.get_current_context().exit(ExitCode.FAIL if found else ExitCode.DONE)
+    click.get_current_context().exit(ExitCode.FAIL if found else ExitCode.UNDECIDED if open_names else ExitCode.DONE)
 
 
 def _made_folder(path: str) -> Path:
@@ -237,8 +241,9 @@ Examples:
   arview decisions list out/
   arview decisions list out/ -o decisions.csv""",
     exit_codes={
-        ExitCode.DONE: "the log is as it was written",
+        ExitCode.DONE: "signed, and the log is as it was written",
         ExitCode.FAIL: "a line was changed or removed; it is named",
+        ExitCode.UNDECIDED: "no signature holds",
     },
 )
 @click.argument("job", metavar="JOB")
@@ -264,8 +269,10 @@ def list_decisions(job: str, output: str | None) -> None:
         write_file(target, quality.decisions_csv(content.entries, loaded.part, loaded.serial).encode("utf-8"))
         click.echo(f"wrote {target}")
     _told_state(job)
-    if content.faults:
-        click.get_current_context().exit(ExitCode.FAIL)
+    if not content.entries:
+        click.echo("not signed: nobody has decided anything")
+    if content.faults or quality.log_of(job).signature() is None:
+        click.get_current_context().exit(ExitCode.FAIL if content.faults else ExitCode.UNDECIDED)
 
 
 def _told_state(job: str) -> bool:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from arview import acceptance
-from arview.cli.common import UNIT, main, output_path, say
+from arview.cli.common import UNIT, inspection_file, main, output_path, say
 from arview.cli.exit_codes import ExitCode, exit_code_of
 from arview.core.atomic import write_file
 from arview.core.extras import require
@@ -30,11 +30,10 @@ Examples:
   arview verify out/inspection.json samples/plate/truth.json --mpe 0.1+L/10000
   arview verify out/inspection.json certificate.toml --mpe 0.05+L/5000 -o verify.json --plot verify.png
   arview verify points.csv lengths.csv --mpe 0.2
-  arview verify out/inspection.json cmm.csv
   Notes: docs/reference/command-notes.md""",
     exit_codes={
-        ExitCode.DONE: "every length passes, and the stated U is confirmed; every E_n is at most 1",
-        ExitCode.FAIL: "a length fails, or the stated U is too small, or an E_n is above 1",
+        ExitCode.DONE: "every length passes, and the stated U is confirmed",
+        ExitCode.FAIL: "a length fails, or the stated U is too small",
         ExitCode.UNDECIDED: "no length fails, but one is undecided",
     },
 )
@@ -43,8 +42,6 @@ Examples:
 @click.option("--mpe", metavar="A+L/K[<=B]", help="Maximum permissible error in mm; without it only U is tested.")
 @click.option("-o", "--output", metavar="JSON", help="Write all lengths, errors and verdicts.")
 @click.option("--plot", metavar="PNG", help="Plot the errors over the length (png, svg, pdf).")
-@click.option("--part", "part_path", metavar="PART", help="Part or CAD file, for positions of an old inspection.")
-@UNIT
 @click.option("--all", "shows_all", is_flag=True, help=f"Print every length, not only the {_SHOWN} worst.")
 def verify(
     measured: str,
@@ -52,23 +49,16 @@ def verify(
     mpe: str | None,
     output: str | None,
     plot: str | None,
-    part_path: str | None,
-    unit: str | None,
     shows_all: bool,
 ) -> None:
     """Test what was MEASURED against KNOWN lengths: errors, limits, and whether the stated U is confirmed."""
-    from arview.cad import load_part
-
     limit = None if mpe is None else acceptance.parse_limit(mpe)
     target = None if output is None else output_path(output, [measured, known])
     picture = None if plot is None else output_path(plot, [measured, known, target])
     if picture is not None:
         require("--plot", "matplotlib")
     if _is_list(measured, known):
-        if limit is not None or picture is not None:
-            raise InputError(f"{known}: lists components, not lengths; --mpe and --plot do not apply")
-        _compare(measured, known, target, None if part_path is None else load_part(part_path, unit).model, shows_all)
-        return
+        raise InputError(f"{known}: lists places of components, not lengths; use arview compare {known} {measured}")
     places = acceptance.read_measured(measured)
     test = acceptance.verify(places, acceptance.read_known(known, places), known, limit)
     _print(test, shows_all)
@@ -100,10 +90,11 @@ agree. A component has that of its worst coordinate, which is named, with U and 
     exit_codes={
         ExitCode.DONE: "every E_n is at most 1",
         ExitCode.FAIL: "an E_n is above 1",
+        ExitCode.UNDECIDED: "no E_n is above 1, but a component was not compared",
     },
 )
 @click.argument("listed", metavar="LIST")
-@click.argument("inspection", metavar="[INSPECTION]", required=False)
+@click.argument("inspection", metavar="[INSPECTION]", required=False, callback=inspection_file)
 @click.option("-o", "--output", metavar="JSON", help="Write all differences and E_n numbers.")
 @click.option("--part", "part_path", metavar="PART", help="Part or CAD file, for positions of an old inspection.")
 @UNIT
@@ -114,12 +105,12 @@ def compare(
     """Compare LIST with an inspection, component by component."""
     from arview.cad import load_part
 
-    source = inspection or str(Path(listed).parent)
+    source = inspection or str(Path(listed).parent / "inspection.json")
     target = None if output is None else output_path(output, [source, listed])
     if not Path(listed).is_file():
         raise InputError(f"{listed}: no such file; give the CSV list of the other measurement")
-    if inspection is None and not (Path(source) / "inspection.json").is_file():
-        raise InputError(f"{source}: holds no inspection.json; name the inspection after the list")
+    if inspection is None and not Path(source).is_file():
+        raise InputError(f"{Path(listed).parent}: holds no inspection.json; name the inspection after the list")
     _compare(source, listed, target, None if part_path is None else load_part(part_path, unit).model, shows_all)
 
 
@@ -134,9 +125,7 @@ def _compare(measured: str, known: str, target: Path | None, model: Model | None
     """Compare an inspection with a list of components, and end with the exit code of the comparison."""
     from arview.inspection import load_inspection
 
-    source = Path(measured)
-    source = source / "inspection.json" if source.is_dir() else source
-    found = acceptance.compare(load_inspection(source, model), acceptance.read_position_list(known), known, model)
+    found = acceptance.compare(load_inspection(measured, model), acceptance.read_position_list(known), known, model)
     _print_left_out(found.left_out)
     width = max(9, *(len(one.name) for one in found.components))
     click.echo(f"{'component':{width}}" + "".join(f"{head:>9}" for head in _COMPARED))
@@ -154,14 +143,16 @@ def _compare(measured: str, known: str, target: Path | None, model: Model | None
     if any(one.list_uncertainty_mm is None for one in found.components):
         say("note: the list states no U for some coordinates: their E_n takes the inspection's U alone")
     agreeing = sum(bool(one.agrees) for one in found.components)
-    click.echo(f"E_n ≤ 1 for {agreeing} of {len(found.components)} components")
+    missed = f"; {len(found.left_out)} were not compared" if found.left_out else ""
+    click.echo(f"E_n ≤ 1 for {agreeing} of {len(found.components)} compared components{missed}")
     if target is not None:
         write_file(
             target, (json.dumps(acceptance.comparison_record(found), indent=2, ensure_ascii=False) + "\n").encode()
         )
         click.echo(f"wrote {target}")
     everything = all(one.agrees is not False for one in found.components)
-    click.get_current_context().exit(ExitCode.DONE if everything else ExitCode.FAIL)
+    code = ExitCode.UNDECIDED if found.left_out else ExitCode.DONE
+    click.get_current_context().exit(code if everything else ExitCode.FAIL)
 
 
 def _cell(value: float | None, kind: str) -> str:
