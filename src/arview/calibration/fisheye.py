@@ -1,4 +1,4 @@
-"""Adjustment of a fisheye camera and of the poses of a board in all views, by Levenberg's and Marquardt's method.
+"""Adjustment of a fisheye camera and of the poses of a board in all views, by least squares.
 
 The start is found by trying fields of view: an equidistant lens (Kannala and Brandt 2006 with all terms zero) of each
 gives the poses of the views, and the one whose corners fit best is adjusted.
@@ -14,7 +14,7 @@ from arview.calibration.board_view import BoardView
 from arview.calibration.projection import fisheye_camera, intrinsics_of, pose_of_board, project
 from arview.camera import Camera
 from arview.errors import InputError
-from arview.geometry import Array, exp_so3
+from arview.geometry import Array, exp_se3, exp_so3
 
 START_HALF_ANGLES_DEG: tuple[float, ...] = (30.0, 45.0, 60.0, 75.0, 90.0, 105.0)
 """Angles off the axis, at the border of the picture's longer side, that are tried."""
@@ -67,61 +67,37 @@ def _cost(views: Sequence[BoardView], camera: Camera, poses: Array) -> float:
 
 
 def _adjusted(views: Sequence[BoardView], camera: Camera, poses: Array) -> tuple[float, Camera, Array]:
-    """Sum of squares, camera and poses after the adjustment from a start."""
-    cost, damping = _cost(views, camera, poses), 1e-3
-    for _ in range(MAX_STEPS):
-        system = _Normal(views, camera, poses)
-        while True:
-            try:
-                intrinsics, turns = system.step(damping)
-                trial = fisheye_camera(camera.width, camera.height, (intrinsics_of(camera) + intrinsics).tolist())
-                moved = np.array([_moved(pose, turn) for pose, turn in zip(poses, turns, strict=True)])
-                trial_cost = _cost(views, trial, moved)
-            except (np.linalg.LinAlgError, InputError):
-                trial_cost = np.inf
-            if trial_cost < cost:
-                break
-            damping *= 10.0
-            if damping > 1e8:
-                return cost, camera, poses
-        change = (cost - trial_cost) / max(cost, 1e-30)
-        camera, poses, cost, damping = trial, moved, trial_cost, max(0.1 * damping, 1e-12)
-        if change < TOLERANCE:
-            break
-    return cost, camera, poses
+    """Sum of squares, camera and poses after the adjustment from a start, by MINPACK's Levenberg-Marquardt method."""
+    from scipy.optimize import least_squares
 
+    def placed(x: Array) -> tuple[Camera, Array]:
+        moved = poses.copy()
+        for pose, step in zip(moved, x[8:].reshape(-1, 6), strict=True):
+            pose[:3, :3] = exp_so3(step[:3]) @ pose[:3, :3]  # about the origin of the board
+            pose[:3, 3] += step[3:]
+        return fisheye_camera(camera.width, camera.height, x[:8].tolist()), moved
 
-def _moved(pose: Array, step: Array) -> Array:
-    """A pose turned in the camera frame, around the board's origin, and shifted."""
-    moved = pose.copy()
-    moved[:3, :3] = exp_so3(step[:3]) @ pose[:3, :3]
-    moved[:3, 3] += step[3:]
-    return moved
+    def residuals(x: Array) -> Array:
+        try:
+            trial, moved = placed(x)
+        except InputError:  # a step beyond any lens; the next one is shorter
+            return np.full(sum(view.pixels.size for view in views), 1e6)
+        pairs = zip(views, moved, strict=True)
+        return np.concatenate([(project(v.points_in_board, trial, m)[0] - v.pixels).ravel() for v, m in pairs])
 
+    def jacobian(x: Array) -> Array:
+        trial, moved = placed(x)
+        rows = []
+        for k, (view, pose) in enumerate(zip(views, moved, strict=True)):
+            _, by_lens, by_pose = project(view.points_in_board, trial, pose)
+            by_all = np.zeros((len(by_lens), len(x)))
+            step = x[8 + 6 * k : 11 + 6 * k]
+            turn = np.stack([exp_se3([*step, *axis])[:3, 3] for axis in np.eye(3)], axis=1)  # left Jacobian of SO(3)
+            by_all[:, :8] = by_lens
+            by_all[:, 8 + 6 * k : 14 + 6 * k] = np.concatenate([by_pose[:, :3] @ turn, by_pose[:, 3:]], axis=1)
+            rows.append(by_all)
+        return np.concatenate(rows)
 
-class _Normal:
-    """Normal equations of all views, with a block for the intrinsics and one for each pose."""
-
-    def __init__(self, views: Sequence[BoardView], camera: Camera, poses: Array) -> None:
-        parts = []
-        for view, pose in zip(views, poses, strict=True):
-            pixels, a, b = project(view.points_in_board, camera, pose)
-            r = (view.pixels - pixels).ravel()
-            parts.append((a.T @ a, a.T @ b, b.T @ b, a.T @ r, b.T @ r))
-        self.aa, self.ab, self.bb, self.ar, self.br = (np.array(column) for column in zip(*parts, strict=True))
-
-    def step(self, damping: float) -> tuple[Array, Array]:
-        """Changes (P,) of the intrinsics and (V,6) of the poses, with the diagonal increased by a share."""
-        count = self.bb.shape[1]
-        bb = self.bb.copy()
-        diagonal = np.arange(count)
-        bb[:, diagonal, diagonal] *= 1.0 + damping
-        aa = self.aa.sum(axis=0)
-        aa[np.diag_indices(len(aa))] *= 1.0 + damping
-        # Schur complement: the poses are eliminated view by view.
-        back = np.linalg.solve(bb, np.concatenate([self.ab.transpose(0, 2, 1), self.br[:, :, None]], axis=2))
-        left = aa - np.einsum("vij,vjk->ik", self.ab, back[:, :, :-1])
-        right = self.ar.sum(axis=0) - np.einsum("vij,vj->i", self.ab, back[:, :, -1])
-        intrinsics = np.linalg.solve(left, right)
-        poses = back[:, :, -1] - back[:, :, :-1] @ intrinsics
-        return intrinsics, poses
+    start = np.concatenate([intrinsics_of(camera), np.zeros(6 * len(poses))])
+    found = least_squares(residuals, start, jacobian, method="lm", x_scale="jac", ftol=TOLERANCE, max_nfev=MAX_STEPS)
+    return 2.0 * float(found.cost), *placed(found.x)
