@@ -205,7 +205,7 @@ def check_part(part: Part, camera: Camera | None = None) -> PartCheck:
         text = f"own symmetries were not searched, to save time, of {len(shapes.skipped)} components: "
         findings.append(PartFinding("note", text + listed(shapes.skipped, 4)))
     findings += [PartFinding("note", text) for text in untold_tolerances(part)]
-    findings += _hidden_findings(part)
+    findings += [*_number_findings(part), *_hidden_findings(part)]
     return PartCheck(
         part=part,
         camera=camera,
@@ -411,6 +411,20 @@ def _role_findings(part: Part) -> list[PartFinding]:
     if not part.inspected:
         findings.append(PartFinding("warning", "no component has the role inspect: nothing is measured"))
     return findings
+
+
+def _number_findings(part: Part) -> list[PartFinding]:
+    """Components that the CAD gives one name, and the part file settings of their own by their numbers."""
+    groups: dict[str, list[ComponentSettings]] = {}
+    for settings, path in zip(part.settings, part.paths, strict=True):
+        if path and re.fullmatch(re.escape(path[-1]) + r"(_\d+)?", settings.name):
+            groups.setdefault(path[-1], []).append(settings)
+    told = [s.name for group in groups.values() if len({replace(s, name="") for s in group}) > 1 for s in group]
+    text = (
+        "the CAD gives these one name, so that they are numbered by their places (along x, then y, then z), and their "
+    )
+    text += "settings go to others when one is added, removed or moved past another; give them names of their own there"
+    return [PartFinding("warning", f"{text}: {listed(told, 6)}")] if told else []
 
 
 def _hidden_findings(part: Part) -> list[PartFinding]:

@@ -169,7 +169,7 @@ def load_part(path: str | Path, unit: str | None = None) -> Part:
     if path.suffix.lower() != ".toml":
         cad = load_cad(path, unit)
         settings = tuple(ComponentSettings(component.name) for component in cad.model.components)
-        return Part(path.stem, path, path, cad.model, settings, up=cad.up, notes=cad.notes, paths=cad.paths)
+        return Part(cad.model.name, path, path, cad.model, settings, up=cad.up, notes=cad.notes, paths=cad.paths)
     try:
         text = path.read_bytes().decode("utf-8")
     except UnicodeDecodeError as error:

@@ -8,6 +8,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from enum import StrEnum
+from html import escape
+from typing import Any
 
 from arview.cad import Model
 from arview.errors import InputError, MismatchError
@@ -264,6 +266,30 @@ class Inspection:
         found = ", ".join(f"{count} {verdict}" for verdict, count in counts.most_common())
         return f"<Inspection {f'{self.part} {self.serial}'.rstrip()}: {found}>"
 
+    def to_dict(self) -> dict[str, Any]:
+        """The inspection as JSON values, as in ``inspection.json``."""
+        from arview.inspection.document import to_document
+
+        return to_document(self)
+
+    def to_table(self) -> list[dict[str, object]]:
+        """A row for each component, as a data frame takes them; what was not determined is None."""
+        rows: list[dict[str, object]] = []
+        for one in self.components:
+            displacement = dict(zip(("dx_mm", "dy_mm", "dz_mm"), one.displacement_mm, strict=True))
+            names = ("distance_mm", "uncertainty_mm", "tolerance_mm", "tilt_deg", "twist_deg")
+            values = {name: getattr(one, name) for name in names}
+            rows.append({"component": one.name, **displacement, **values, "verdict": one.verdict.value})
+        return rows
+
+    def _repr_html_(self) -> str:
+        """The table, as notebooks show it."""
+        rows = self.to_table()
+        head = "".join(f"<th>{name}</th>" for name in rows[0]) if rows else ""
+        lines = ["".join(f"<td>{_cell(value)}</td>" for value in row.values()) for row in rows]
+        table = "".join(f"<tr>{line}</tr>" for line in (head, *lines))
+        return f"<p>{escape(f'{self.part} {self.serial}'.rstrip())}</p><table>{table}</table>"
+
     def find(self, name: str) -> ComponentDeviation | None:
         """The entry of the component with this name, or None if it was not inspected."""
         return next((component for component in self.components if component.name == name), None)
@@ -281,6 +307,11 @@ class Inspection:
         faults = model_faults(self.model_hash, [component.name for component in self.components], model)
         if faults:
             raise MismatchError(f"the inspection of {self.part!r} {'; it '.join(faults)}")
+
+
+def _cell(value: object) -> str:
+    """A value of the table as HTML, numbers to a micrometre."""
+    return "" if value is None else f"{value:.3f}" if isinstance(value, float) else escape(str(value))
 
 
 def model_faults(model_hash: object, names: Sequence[str], model: Model) -> list[str]:

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path, PureWindowsPath
 
+from arview.cad.formats.archive import STEP_SUFFIXES
 from arview.cad.formats.step_statements import (
     DEFINITION,
     PLACEMENT,
@@ -24,7 +25,7 @@ from arview.cad.formats.step_statements import (
 )
 from arview.errors import InputError
 
-SUFFIXES = (".step", ".stp", ".p21")
+SUFFIXES = (*STEP_SUFFIXES, ".stpz")
 MAX_BYTES = 500_000_000
 """Largest size of an assembly with all its files: files that use others twice multiply."""
 _MAX_DEPTH = 30

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from arview.cad.formats.archive import unpacked
 from arview.cad.formats.raw import check_instance_count, short_list, unit_in_mm
 from arview.cad.formats.step_external import OtherFiles, products_without_shape
 from arview.cad.formats.step_scene import drop_repeated, hide_bodies, name_uses
@@ -36,7 +37,7 @@ def prepare_step(data: bytes, path: Path) -> tuple[bytes, list[str]]:
     Raises:
         InputError: not STEP, parentheses that never close, an assembly in itself, or too many components.
     """
-    others = OtherFiles(lambda file: _checked_text(file.read_bytes(), file))
+    others = OtherFiles(lambda file: _checked_text(unpacked(file), file))
     data = others.added(_checked_text(data, path), path)
     _check_instances(data, path)
     notes, products = list[str](), Products(data)

@@ -68,6 +68,14 @@ def prepare_cloud(cloud: DenseCloud, box: Array, grid_mm: float, min_points: int
     return grid_average(filled, grid_mm)
 
 
+def typical_spacing(cloud: CloudPoints) -> float:
+    """Distance between neighbouring points: of points that lie at random, the side of the square that each has."""
+    from scipy.spatial import cKDTree
+
+    few = cloud.points[:: max(1, len(cloud) // 5000)]
+    return float(2.0 * np.median(cKDTree(cloud.points).query(few, k=2)[0][:, 1]))
+
+
 def join(parts: list[CloudPoints]) -> CloudPoints:
     """All points in one."""
     return CloudPoints(
