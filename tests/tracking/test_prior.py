@@ -39,7 +39,7 @@ def after(session: TrackingSession, prior: PosePrior | None) -> Pose:
 
 def test_a_jump_that_is_known_is_followed_without_a_search() -> None:
     near = wrong(AFTER, np.random.default_rng(5), 4.0, 3.0)
-    pose = after(started(SessionOptions(finder=NoFinder())), PosePrior(near, UNSURE))
+    pose = after(started(SessionOptions(finder=NoFinder())), PosePrior(near))
     assert pose.state is TrackingState.TRACKED and pose.cam_from_model is not None
     mm, _, deg = error(pose.cam_from_model, AFTER)
     assert mm < 1.5 and deg < 0.5

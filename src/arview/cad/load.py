@@ -182,8 +182,7 @@ def _read(path: Path, suffix: str, tol_linear_mm: float, tol_angular_deg: float,
 
 def _read_by_plug_in(path: Path, entry: EntryPoint) -> RawModel:
     """A file read by another package: pairs of a name and a `trimesh.Trimesh` in mm."""
-    read = load_plug_in(entry)
-    raw = RawModel(unit_mm=1.0)
+    read, raw = load_plug_in(entry), RawModel(unit_mm=1.0)
     try:
         for name, mesh in read(path):
             vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)

@@ -211,8 +211,7 @@ def in_model_frame(reconstruction: MetricReconstruction, part: Part) -> MetricRe
     )
     if turned:
         warnings.append(turned)
-    evidence = scale.evidence
-    std = scale.scale_std
+    evidence, std = scale.evidence, scale.scale_std
     if scale.scale is not None and not reconstruction.sparse.photos:
         moved, std, note = _checked_scale(moved, part, reconstruction.rescales)
         warnings += [note] if note else []

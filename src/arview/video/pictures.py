@@ -220,11 +220,8 @@ def pictures_among(paths: Iterable[Path]) -> list[Path]:
 
 def is_film(path: Path) -> bool:
     """Whether a picture is an animated PNG, which FFmpeg reads."""
-    if path.suffix.lower() != ".png":
-        return False
     with path.open("rb") as file:
-        head = file.read(1 << 16)
-    return b"acTL" in head.partition(b"IDAT")[0]
+        return path.suffix.lower() == ".png" and b"acTL" in file.read(1 << 16).partition(b"IDAT")[0]
 
 
 def is_picture(path: Path) -> bool:

@@ -54,8 +54,7 @@ def open_source(
         InputError: the source does not exist or cannot be read.
     """
     check_type(spec, PATH, "open_source: spec")
-    wanted = FrameRange(start or 0, end, stride)
-    text = str(spec)
+    wanted, text = FrameRange(start or 0, end, stride), str(spec)
     if not 0 < fps < float("inf"):
         raise InputError(f"fps {fps}: expected a positive number of frames per second")
     path = Path(text.removeprefix("file://"))

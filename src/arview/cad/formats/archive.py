@@ -26,30 +26,29 @@ def unpacked(path: Path) -> bytes:
     """
     data = path.read_bytes()
     limit = min(_MAX_BYTES, max(_RATIO_FROM_BYTES, _MAX_RATIO * len(data)))
-    name, content = path.stem, data
     try:
-        if data.startswith(b"\x1f\x8b"):
-            with gzip.open(io.BytesIO(data)) as file:
-                content = file.read(limit + 1)
-        elif data.startswith((b"PK\x03\x04", b"PK\x05\x06")):
-            with zipfile.ZipFile(io.BytesIO(data)) as archive:
-                name = _model_in(archive, path)
-                with archive.open(name) as file:
-                    content = file.read(limit + 1)
+        content = _content(data, limit + 1, path)
     except _BROKEN as error:
         raise InputError(f"{path}: this archive cannot be unpacked ({error}); give the STEP file itself") from error
     if len(content) > max(limit, len(data)):
         raise InputError(f"{path}: {len(data) / 1e6:.1f} MB that unpack to more than {limit / 1e6:.0f} MB are no model")
-    if content is not data and b"ISO-10303-21" not in content[:4096]:
-        raise InputError(f"{path}: holds {name}; of packed files only STEP is read: unpack it and give the model")
     return content
 
 
-def _model_in(archive: zipfile.ZipFile, path: Path) -> str:
-    """The name of the only STEP file in an archive, or of its only file."""
-    names = [n for n in archive.namelist() if not n.endswith("/") and not n.startswith("__MACOSX/")]
-    models = [n for n in names if n.lower().endswith(STEP_SUFFIXES)] or names
-    if len(models) != 1:
-        told = short_list(models) or "no file"
-        raise InputError(f"{path}: one STEP file is expected in it, it holds {told}; unpack it and give one model")
-    return models[0]
+def _content(data: bytes, limit: int, path: Path) -> bytes:
+    """The first bytes of what is packed in a file; all of a file that is no archive."""
+    if data.startswith(b"\x1f\x8b"):
+        names, content = [path.stem], gzip.GzipFile(fileobj=io.BytesIO(data)).read(limit)
+    elif data.startswith((b"PK\x03\x04", b"PK\x05\x06")):
+        archive = zipfile.ZipFile(io.BytesIO(data))
+        files = [name for name in archive.namelist() if not name.endswith("/") and not name.startswith("__MACOSX/")]
+        names = [name for name in files if name.lower().endswith(STEP_SUFFIXES)] or files
+        content = archive.open(names[0]).read(limit) if len(names) == 1 else b""
+    else:
+        return data
+    if b"ISO-10303-21" not in content[:4096]:
+        told = short_list(names) or "no file"
+        raise InputError(
+            f"{path}: holds {told}; of packed files only one of STEP is read: unpack it and give the model"
+        )
+    return content

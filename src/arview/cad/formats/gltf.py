@@ -115,8 +115,7 @@ class _Gltf:
         self.hidden: list[str] = []
 
     def read(self) -> RawModel:
-        nodes = self.tree.get("nodes", [])
-        scenes = self.tree.get("scenes", [])
+        nodes, scenes = self.tree.get("nodes", []), self.tree.get("scenes", [])
         if scenes:
             roots = scenes[self.tree.get("scene", 0)].get("nodes", [])
         else:
@@ -126,8 +125,7 @@ class _Gltf:
             self._visit(root, np.eye(4), ())
         self._read_conventions()
         if self.hidden:
-            told = short_list(self.hidden)
-            self.model.notes.append(f"{LEFT_OUT_HIDDEN % 'glTF'}: {told}")
+            self.model.notes.append(f"{LEFT_OUT_HIDDEN % 'glTF'}: {short_list(self.hidden)}")
         return self.model
 
     def _visit(self, index: int, root_from_parent: Array, path: tuple[str, ...]) -> None:
@@ -229,8 +227,7 @@ class _Gltf:
 
     def _color(self, primitive: dict[str, Any], decoded: draco.DracoMesh | None) -> Color | None:
         """Base colour of a primitive's material, times its mean vertex colour, as sRGB."""
-        linear = np.ones(3)
-        known = False
+        linear, known = np.ones(3), False
         if "material" in primitive:
             pbr = self.tree["materials"][primitive["material"]].get("pbrMetallicRoughness", {})
             known = "baseColorFactor" in pbr or "baseColorTexture" not in pbr
@@ -271,10 +268,9 @@ def _check_extensions(tree: dict[str, Any], path: Path) -> None:
 
 def _is_hidden(node: dict[str, Any]) -> bool:
     """Whether a node is hidden with all below it, by the extension or by the custom data of exporters."""
-    extras = node.get("extras")
-    extras = extras if isinstance(extras, dict) else {}
-    shown = (node.get("extensions", {}).get(_VISIBILITY, {}).get("visible"), extras.get("visible"))
-    return any(value is False for value in shown) or extras.get("hidden") is True
+    told = {**node["extras"]} if isinstance(node.get("extras"), dict) else {}
+    own = node.get("extensions", {}).get(_VISIBILITY, {})
+    return own.get("visible") is False or told.get("visible") is False or told.get("hidden") is True
 
 
 def _node_matrix(node: dict[str, Any]) -> Array:

@@ -187,11 +187,8 @@ def unique_names(
 def _by_place(indices: list[int], places: Array) -> list[int]:
     """Indices of components in the order of their places along x, y and z, whatever the noise of an export is."""
     points = places[indices]
-    levels = []
-    for values in points.T:
-        order = np.argsort(values, kind="stable")
-        steps = np.diff(values[order], prepend=values[order[:1]]) > SAME_PLACE * np.ptp(points, axis=0).max()
-        level = np.empty(len(values), dtype=np.int64)
-        level[order] = np.cumsum(steps)
-        levels.append(level)
-    return [indices[k] for k in np.lexsort(levels[::-1])]
+    order = np.argsort(points, axis=0, kind="stable")
+    ranked = np.take_along_axis(points, order, axis=0)
+    steps = np.diff(ranked, axis=0, prepend=ranked[:1]) > SAME_PLACE * np.ptp(points, axis=0).max()
+    levels = np.take_along_axis(np.cumsum(steps, axis=0), np.argsort(order, axis=0), axis=0)
+    return [indices[k] for k in np.lexsort(levels.T[::-1])]

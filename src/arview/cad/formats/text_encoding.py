@@ -6,7 +6,6 @@ import codecs
 import re
 
 _MARKS = ((codecs.BOM_UTF8, "utf-8-sig"), (codecs.BOM_UTF16_LE, "utf-16"), (codecs.BOM_UTF16_BE, "utf-16"))
-_LINE = re.compile(rb"[^\n]*[\x80-\xff][^\n]*")
 _RUN = re.compile(rb"[\x80-\xff]+")
 _FOREIGN = re.compile(rb"(?<![A-Za-z])[\x80-\xff]{2,}+|[\x80-\xff]{2,}+(?![A-Za-z])")
 _CYRILLIC = re.compile(rb"[\xab\xb9]?(?:[\xc0-\xdf\xa8]?[\xe0-\xff\xb8]+|[\xc0-\xdf]+)\xbb?|\xb9")
@@ -34,7 +33,7 @@ def text_encoding(data: bytes) -> str:
     for mark, encoding in _MARKS:
         if data.startswith(mark):
             return encoding
-    lines = b"\n".join(_LINE.findall(data))
+    lines = b"\n".join(line for line in data.split(b"\n") if not line.isascii())
     if _fits(lines, "utf-8", 0.0):
         return "utf-8"
     runs = _RUN.findall(lines)

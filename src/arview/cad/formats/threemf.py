@@ -129,13 +129,9 @@ class _Archive:
 
     def number(self, text: str) -> float:
         """A number, which some programs write with a decimal comma; none is a comma before thousands and a point."""
-        try:
-            return float(text)
-        except ValueError:
-            value = float(text.replace(",", "."))
-        if COMMAS not in self.model.notes:
+        if "," in text and COMMAS not in self.model.notes:
             self.model.notes.append(COMMAS)
-        return value
+        return float(text.replace(",", "."))
 
     def _main_part(self, names: list[str]) -> str:
         """Name of the 3D model part: by the relationships of the package, else the only candidate."""

@@ -441,8 +441,7 @@ def _with_swapped_name(
     """Add to a component that did not fit the name of another one whose shape does: the two may be swapped."""
     if isinstance(found, Move) or found.is_missing or "shape" not in found.reason or c.others is None:
         return found
-    foot = c.others.closest(c.center[None]).points[0]
-    tried = [c]
+    foot, tried = c.others.closest(c.center[None]).points[0], [c]
     for other in all_of_them:
         if other.others is None or any(_same_shape(other, done) for done in tried):
             continue

@@ -134,8 +134,11 @@ def histogram_picture(distances: DistanceMap, model: Model, component: str | Non
     span = min(distances.reach_mm, max(6.0 * row.fwhm_mm, 0.05))
     edges = np.linspace(row.median_mm - span, row.median_mm + span, 81)
     count, _ = np.histogram(distances.distances[mine], edges)
-    title = f"{name}: mean {row.mean_mm:+.3f}, sigma {row.sigma_mm:.3f}, FWHM {row.fwhm_mm:.3f} mm"
-    chart = Chart(title, f"signed distance of {row.count} points to the CAD / mm", "points")
+    chart = Chart(
+        f"{name}: mean {row.mean_mm:+.3f}, sigma {row.sigma_mm:.3f}, FWHM {row.fwhm_mm:.3f} mm",
+        f"signed distance of {row.count} points to the CAD / mm",
+        "points",
+    )
     chart.add(0.5 * (edges[1:] + edges[:-1]), count, "", "bars")
     return chart.draw()
 

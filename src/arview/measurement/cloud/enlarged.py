@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 
 from arview.cad import Model, Part, make_model
-from arview.geometry import Array, rigid
 from arview.measurement.types import Move
 from arview.reconstruction import DenseCloud, PosedPhoto
 
@@ -25,18 +24,14 @@ def enlarged(
     cloud: DenseCloud, model: Model, part: Part, photos: Sequence[PosedPhoto], by: float
 ) -> tuple[DenseCloud, Model, Part, list[PosedPhoto]]:
     """A cloud, the CAD with its symmetries, and the places of photos, enlarged by a factor."""
-    sigma = np.asarray(cloud.sigma * by, dtype=np.float32)
     components = tuple(replace(one, vertices_in_model=by * one.vertices_in_model) for one in model.components)
-    settings = []
-    for one in part.settings:
-        x, y, z = one.symmetry.through_in_model if one.symmetry else (0.0, 0.0, 0.0)
-        symmetry = one.symmetry and replace(one.symmetry, through_in_model=(by * x, by * y, by * z))
-        settings.append(replace(one, symmetry=symmetry))
+    settings = tuple(replace(one, symmetry=one.symmetry and one.symmetry.enlarged(by)) for one in part.settings)
+    scale = np.diag([by, by, by, 1.0])
     return (
-        replace(cloud, points=cloud.points * by, sigma=sigma),
+        replace(cloud, points=cloud.points * by, sigma=(cloud.sigma * by).astype(np.float32)),
         make_model(model.name, components),
-        replace(part, settings=tuple(settings)),
-        [replace(one, cam_from_scan=_at(one.cam_from_scan, by)) for one in photos],
+        replace(part, settings=settings),
+        [replace(one, cam_from_scan=scale @ one.cam_from_scan @ np.linalg.inv(scale)) for one in photos],
     )
 
 
@@ -51,7 +46,3 @@ def reduced(move: Move, by: float) -> Move:
         radius_mm=move.radius_mm / by,
         residual_mm=move.residual_mm / by,
     )
-
-
-def _at(pose: Array, by: float) -> Array:
-    return rigid(pose[:3, :3], by * pose[:3, 3])

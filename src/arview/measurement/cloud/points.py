@@ -94,8 +94,7 @@ def grid_average(cloud: CloudPoints, grid_mm: float) -> CloudPoints:
         return cloud
     cell = np.floor(cloud.points / grid_mm).astype(np.int64)
     cell -= cell.min(axis=0)
-    size = cell.max(axis=0) + 1
-    main = np.argmax(np.abs(cloud.normals), axis=1)
+    size, main = cell.max(axis=0) + 1, np.argmax(np.abs(cloud.normals), axis=1)
     side = 2 * main + (np.take_along_axis(cloud.normals, main[:, None], axis=1)[:, 0] < 0)
     key = ((cell[:, 0] * size[1] + cell[:, 1]) * size[2] + cell[:, 2]) * 6 + side
     order = np.argsort(key, kind="stable")

@@ -121,8 +121,7 @@ def _offsets(
     mine[mine] &= faces[closest.faces[mine]]
     facing = np.sum(near.normals * np.nan_to_num(closest.normals), axis=1)
     mine &= (facing > 0.5) | ~near.normals.any(axis=1)
-    chosen = np.flatnonzero(mine)
-    index = model.index(datum.component)
+    chosen, index = np.flatnonzero(mine), model.index(datum.component)
     for clear_mm in (small * CLEAR_MM, small * MIN_CLEAR_MM):
         clear = chosen[~near_others(near.points[chosen], model, index, clear_mm)] if len(chosen) else chosen
         if len(clear) >= min(300, 0.3 * len(chosen)):
