@@ -97,6 +97,12 @@ def test_commas_before_thousands_are_no_decimal_commas(tmp_path: Path) -> None:
         load_cad(path)
 
 
+def test_an_author_in_another_encoding_does_not_change_the_names() -> None:
+    data = "底板 定位块 立柱 螺栓 支架 轴承座\n".encode() + "Müller".encode("latin-1")
+    assert text_encoding(data) == "utf-8"
+    assert decode_text(data).startswith("底板 定位块 立柱 螺栓 支架 轴承座")
+
+
 def test_bytes_that_no_encoding_knows_stay_different() -> None:
     assert decode_text(b"a\x81b\xff") != decode_text(b"a\x8db\xff")
 

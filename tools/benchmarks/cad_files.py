@@ -64,7 +64,8 @@ def of_opencascade(path: Path) -> Found:
     tool = occ("XCAFDoc", "XCAFDoc_DocumentTool").ShapeTool_s(document.Main())
     sequence, label_type = occ("TDF", "TDF_LabelSequence"), occ("TDF", "TDF_Label")
     name_type, shape_tool = occ("TDataStd", "TDataStd_Name"), occ("XCAFDoc", "XCAFDoc_ShapeTool")
-    bounds = occ("Bnd", "Bnd_Box")()
+    bounds, faces = occ("Bnd", "Bnd_Box")(), occ("TopExp", "TopExp_Explorer")
+    face_kind = occ("TopAbs", "TopAbs_ShapeEnum").TopAbs_FACE
 
     def name_of(label: Any) -> str:
         attribute = name_type()
@@ -77,7 +78,8 @@ def of_opencascade(path: Path) -> Found:
         else:
             target = label
         if not shape_tool.IsAssembly_s(target):
-            yield name or name_of(target)
+            if faces(shape_tool.GetShape_s(target), face_kind).More():
+                yield name or name_of(target)
             return
         parts = sequence()
         shape_tool.GetComponents_s(target, parts)

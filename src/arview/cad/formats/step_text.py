@@ -22,7 +22,7 @@ from arview.cad.formats.step_statements import (
     Products,
     plain_name,
 )
-from arview.cad.formats.text_encoding import decode_text, text_encoding
+from arview.cad.formats.text_encoding import decode_text
 from arview.errors import InputError
 
 _MAX_NESTING = 64
@@ -76,8 +76,7 @@ def _checked_text(data: bytes, path: Path) -> bytes:
     if b"ISO-10303-21" not in data[:4096]:
         raise InputError(f"{path}: not a STEP file (ISO-10303-21 is missing at its start)")
     _check_whole(data, path)
-    encoding = text_encoding(data)
-    return data if encoding == "utf-8" else decode_text(data, encoding).encode("utf-8")
+    return data if data.isascii() else decode_text(data).encode("utf-8")
 
 
 def _check_whole(data: bytes, path: Path) -> None:

@@ -25,7 +25,7 @@ COMMAS = "its numbers have decimal commas"
 
 
 def text_encoding(data: bytes) -> str:
-    """The encoding of a text: by its byte order mark, UTF-8 where it is valid, else by what its words look like.
+    """The encoding of a text: by its byte order mark, UTF-8 where it fits, else by what its words look like.
 
     Letters beyond ASCII stand alone in words of most European languages, whose other letters are ASCII. In a Cyrillic
     word small ones follow the first, or all are capitals; two Chinese letters look so once in twenty times.
@@ -34,7 +34,7 @@ def text_encoding(data: bytes) -> str:
         if data.startswith(mark):
             return encoding
     lines = b"\n".join(line for line in data.split(b"\n") if not line.isascii())
-    if _fits(lines, "utf-8", 0.0):
+    if _fits(lines, "utf-8"):
         return "utf-8"
     runs = _RUN.findall(lines)
     high = sum(map(len, runs))
@@ -73,7 +73,7 @@ def with_decimal_points(data: bytes, line: bytes) -> tuple[bytes, list[str]]:
     return lines.sub(lambda match: match[0].replace(b",", b"."), data), [COMMAS]
 
 
-def _fits(data: bytes, encoding: str, lost: float = MAX_LOST) -> bool:
+def _fits(data: bytes, encoding: str) -> bool:
     """Whether few bytes of a text are none in an encoding."""
     bad = data.decode(encoding, errors="replace").count("\ufffd")
-    return bad <= lost * sum(map(len, _RUN.findall(data)))
+    return bad <= MAX_LOST * sum(map(len, _RUN.findall(data)))
