@@ -93,9 +93,12 @@ def of_opencascade(path: Path) -> Found:
     for index in range(1, free.Length() + 1):
         names += leaves(free.Value(index), "")
         shape = shape_tool.GetShape_s(free.Value(index))
-        # Of triangles, because the box of surfaces without them reaches beyond trimmed ones.
+        # Of triangles, because the box of surfaces without them reaches beyond trimmed ones; and without loose curves.
         occ("BRepMesh", "BRepMesh_IncrementalMesh")(shape, 0.1, False, 0.17, True)
-        occ("BRepBndLib", "BRepBndLib").AddOptimal_s(shape, bounds, True, False)
+        explorer = faces(shape, face_kind)
+        while explorer.More():
+            occ("BRepBndLib", "BRepBndLib").AddOptimal_s(explorer.Current(), bounds, True, False)
+            explorer.Next()
     if bounds.IsVoid():
         return Found(tuple(names), fault="no shape")
     low, high = bounds.CornerMin(), bounds.CornerMax()
@@ -140,7 +143,11 @@ def differences(own: Found, other: Found) -> list[str]:
         # Names of files and numbers are what a reader gives to what has none.
         lost = Counter(map(base_name, other.names)) - Counter(map(base_name, own.names))
         lost = Counter(
-            {name: n for name, n in lost.items() if name and not re.search(r"^\d+$|\.(stl|ply|obj)$", name, re.I)}
+            {
+                name: n
+                for name, n in lost.items()
+                if name and not re.search(r"^\d+$|\.(stl|ply|obj)$|^=>\[|^NAUO\d|^Open CASCADE", name, re.I)
+            }
         )
         if lost:
             told.append(f"names of the other: {', '.join(list(lost)[:3])}; here {', '.join(own.names[:3])}")
