@@ -51,9 +51,9 @@ def test_the_unit_of_packed_step_can_be_overridden(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("files", "reason"),
     [
-        ({"a.stp": b"1", "b.stp": b"2"}, r"holds a\.stp, b\.stp; of packed files only one of STEP is read: unpack it"),
-        ({"a.obj": b"1", "a.mtl": b"2"}, r"holds a\.obj, a\.mtl; of packed files"),
-        ({"a.stl": b"solid a"}, r"holds a\.stl; of packed files only one of STEP is read: unpack it"),
+        ({"a.stp": b"1", "b.stp": b"2"}, r"holds a\.stp, b\.stp; only an archive of one STEP file is read: unpack it"),
+        ({"a.obj": b"1", "a.mtl": b"2"}, r"holds a\.obj, a\.mtl; only an archive"),
+        ({"a.stl": b"solid a"}, r"holds a\.stl; only an archive of one STEP file is read: unpack it"),
         ({}, r"holds no file"),
     ],
 )
@@ -65,7 +65,7 @@ def test_archives_of_other_files_are_refused_in_one_line(files: dict[str, bytes]
 
 def test_packed_files_of_other_kinds_are_named(tmp_path: Path) -> None:
     (tmp_path / "a.obj.gz").write_bytes(gzip.compress(b"v 0 0 0\n"))
-    with pytest.raises(InputError, match=r"holds a\.obj; of packed files only one"):
+    with pytest.raises(InputError, match=r"holds a\.obj; only an archive of one STEP file is read"):
         load_cad(tmp_path / "a.obj.gz")
 
 

@@ -49,6 +49,6 @@ def _content(data: bytes, limit: int, path: Path) -> bytes:
     if b"ISO-10303-21" not in content[:4096]:
         told = short_list(names) or "no file"
         raise InputError(
-            f"{path}: holds {told}; of packed files only one of STEP is read: unpack it and give the model"
+            f"{path}: holds {told}; only an archive of one STEP file is read: unpack it and give the model"
         )
     return content
