@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
+from math import isfinite
 from types import MappingProxyType
 from typing import Any
 
@@ -154,6 +155,55 @@ class Pose:
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state | {"components": MappingProxyType(state["components"])})
+
+    def to_dict(self) -> dict[str, object]:
+        """The pose as JSON values, as in ``poses.jsonl``; a covariance that is not finite becomes None.
+
+        Of a pose, ``presence`` maps each component to its `Presence`, ``presence_details`` to its visibility,
+        probability, observations, spread_deg and, if it is displaced, model_from_nominal (4×4). ``completeness`` is a
+        summary; ``identity``, ``identity_reason``, ``serial`` and ``instance`` say which specimen is meant.
+        """
+        covariance = None if self.covariance is None else self.covariance.tolist()
+        if covariance is not None and not all(isfinite(value) for row in covariance for value in row):
+            covariance = None
+        return {
+            "index": self.index,
+            "time_s": self.time_s,
+            "state": str(self.state),
+            "quality": self.quality,
+            "cam_from_model": None if self.cam_from_model is None else self.cam_from_model.tolist(),
+            "covariance": covariance,
+            "ms": round(self.ms, 4),
+            "reason": self.reason,
+            "mismatches": list(self.mismatches),
+            "unverified": list(self.unverified),
+            "alternatives": [alternative.tolist() for alternative in self.alternatives],
+            **self._specimen(),
+        }
+
+    def _specimen(self) -> dict[str, object]:
+        """Components and identity of a pose as JSON values."""
+        if self.cam_from_model is None:
+            return {"instance": self.instance} if self.instance else {}
+        details = {}
+        for name, one in self.components.items():
+            moved = {} if one.model_from_nominal is None else {"model_from_nominal": one.model_from_nominal.tolist()}
+            details[name] = {
+                "visibility": str(one.visibility),
+                "probability": round(one.probability, 4),
+                "observations": one.observations,
+                "spread_deg": round(one.spread_deg, 1),
+                **moved,
+            }
+        return {
+            "completeness": str(self.completeness),
+            "presence": {name: str(one.presence) for name, one in self.components.items()},
+            "presence_details": details,
+            "identity": str(self.identity),
+            "identity_reason": self.identity_reason,
+            "serial": self.serial,
+            "instance": self.instance,
+        }
 
     @property
     def is_label_withheld(self) -> bool:

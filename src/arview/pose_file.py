@@ -7,8 +7,6 @@ from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
-import numpy as np
-
 from arview.camera import Camera
 from arview.core.atomic import begin_unfinished
 from arview.errors import OutputError
@@ -21,7 +19,8 @@ class PoseWriter:
     A line holds ``index``, ``time_s``, ``state``, ``quality``, ``cam_from_model`` (4×4 row-major, mm, or
     null), ``covariance`` (6×6 or null), ``ms``, ``reason`` (why not ``tracked``, or empty), ``mismatches``
     (list), ``unverified`` (names of components not yet confirmed), ``alternatives`` (list of 4×4 poses that fit as
-    well), and what `presence_record` adds to a pose. Frames that are picture files have ``file``, its name. Where the
+    well), and of a pose what `Pose.to_dict` says of components and
+    identity. Frames that are picture files have ``file``, its name. Where the
     camera was not given, it also holds ``camera`` (fx, fy, cx, cy in px and dist).
 
     Args:
@@ -70,62 +69,16 @@ class PoseWriter:
         return OutputError(f"{self.path}: cannot write the poses: {error.strerror or error}")
 
 
-def presence_record(pose: Pose) -> dict[str, object]:
-    """Components and identity of a pose as JSON values; empty without a pose.
-
-    ``presence`` maps each component to its `Presence`, ``presence_details`` to its visibility, probability,
-    observations, spread_deg and, if it is displaced, model_from_nominal (4×4). ``completeness`` is a summary;
-    ``identity``, ``identity_reason``, ``serial`` and ``instance`` say which specimen is meant.
-    """
-    if pose.cam_from_model is None:
-        return {"instance": pose.instance} if pose.instance else {}
-    details = {}
-    for name, one in pose.components.items():
-        moved = {} if one.model_from_nominal is None else {"model_from_nominal": one.model_from_nominal.tolist()}
-        details[name] = {
-            "visibility": str(one.visibility),
-            "probability": round(one.probability, 4),
-            "observations": one.observations,
-            "spread_deg": round(one.spread_deg, 1),
-            **moved,
-        }
-    return {
-        "completeness": str(pose.completeness),
-        "presence": {name: str(one.presence) for name, one in pose.components.items()},
-        "presence_details": details,
-        "identity": str(pose.identity),
-        "identity_reason": pose.identity_reason,
-        "serial": pose.serial,
-        "instance": pose.instance,
-    }
-
-
 def pose_line(pose: Pose, camera: Camera | None = None, file: str = "") -> str:
-    """A pose, and its camera and picture file if they are given, as a line of ``poses.jsonl``, see `PoseWriter`.
-
-    A covariance that is not finite becomes null.
-    """
-    covariance = pose.covariance
-    is_known = covariance is not None and bool(np.all(np.isfinite(covariance)))
+    """A pose, and its camera and picture file if they are given, as a line of ``poses.jsonl``, see `PoseWriter`."""
     stated = {}
     if camera is not None:
         values = {name: float(getattr(camera, name)) for name in ("fx", "fy", "cx", "cy")}
         stated = {"camera": {**values, "dist": camera.dist.tolist()}}
     return json.dumps(
         {
-            "index": pose.index,
+            **pose.to_dict(),
             **({"file": file} if file else {}),
-            "time_s": pose.time_s,
-            "state": str(pose.state),
-            "quality": pose.quality,
-            "cam_from_model": None if pose.cam_from_model is None else pose.cam_from_model.tolist(),
-            "covariance": covariance.tolist() if covariance is not None and is_known else None,
-            "ms": round(pose.ms, 4),
-            "reason": pose.reason,
-            "mismatches": list(pose.mismatches),
-            "unverified": list(pose.unverified),
-            "alternatives": [alternative.tolist() for alternative in pose.alternatives],
-            **presence_record(pose),
             **stated,
         },
         allow_nan=False,

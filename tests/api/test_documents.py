@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import pkgutil
 import re
 from pathlib import Path
 
@@ -76,3 +77,13 @@ def test_changelog_begins_with_unreleased() -> None:
     assert heads[0] == "Unreleased" and arview.__version__ in heads
     kinds = set(re.findall(r"^### (.+)$", text_of("CHANGELOG.md"), re.MULTILINE))
     assert kinds <= {"Added", "Changed", "Fixed", "Removed"}
+
+
+@pytest.mark.parametrize("document", [name for name in DOCUMENTS if name.startswith(("docs/", "README"))])
+def test_names_of_the_package_in_documents_are_public(document: str) -> None:
+    groups = {"readers", "sources", "commands", "exports"}  # of entry points, see docs/reference/plug-ins.md
+    modules = {module.name for module in pkgutil.iter_modules(arview.__path__)}
+    named = set(re.findall(r"\barview\.([A-Za-z_]+)\b", text_of(document)))
+    imported = re.findall(r"^from arview import (.+)$", text_of(document), re.MULTILINE)
+    named |= {name.strip() for line in imported for name in line.split(",")}
+    assert named - modules - groups - {"__all__"} <= set(arview.__all__)

@@ -391,3 +391,25 @@ def test_many_components_of_one_name_are_told_in_one_line(tmp_path: Path) -> Non
     assert len({c.name for c in cad.model.components}) == 30
     assert len(cad.notes) == 1
     assert "29 more components are named 'bolt': called bolt_2, bolt_3, bolt_4, bolt_5 and 25 more" in cad.notes[0]
+
+
+@pytest.mark.parametrize(
+    "hiding",
+    [
+        {"extensions": {"KHR_node_visibility": {"visible": False}}},
+        {"extras": {"visible": False}},
+        {"extras": {"hidden": True}},
+    ],
+)
+def test_hidden_nodes_are_left_out_with_all_below_and_told(hiding: dict[str, Any], tmp_path: Path) -> None:
+    nodes: list[dict[str, Any]] = [
+        {"name": "plate", "mesh": 0, "extensions": {"KHR_node_visibility": {"visible": True}}, "extras": {"hidden": 0}},
+        {"name": "jig", "children": [2], **hiding},
+        {"name": "clamp", "mesh": 0, "translation": [1.0, 0.0, 0.0]},
+    ]
+    path = glb_with_boxes(tmp_path / "a.glb", nodes, [0, 1], extensionsRequired=["KHR_node_visibility"])
+    cad = load_cad(path)
+    assert [component.name for component in cad.model.components] == ["plate"]
+    np.testing.assert_allclose(np.ptp(cad.model.bounds_in_model, axis=0), SIZE_MM, atol=1e-5)
+    told = "left out, because the glTF file hides them (show and export them to have them): jig"
+    assert cad.notes == (told,)

@@ -11,12 +11,23 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from arview.cad import check_part, load_part
 from arview.cad.fitness import inspect_mesh
 from arview.cad.formats.obj import triangulate
 from arview.cad.formats.text_encoding import decode_text, text_encoding
 from arview.cad.load import load_cad, load_model
 from arview.errors import InputError
-from helpers.cad_files import box, mesh_xml, obj_text, write_3mf
+from helpers.cad_files import (
+    QUARTER_TURN,
+    SHIFT,
+    StepAssembly,
+    StepPart,
+    StepWriter,
+    box,
+    mesh_xml,
+    obj_text,
+    write_3mf,
+)
 
 VERTICES, FACES = box((0, 0, 0), (10, 20, 30))
 MESH = mesh_xml(VERTICES, FACES)
@@ -29,6 +40,15 @@ LOOSE = MESH.replace("</triangles>", '<triangle v1="0" v2="1" v3="99"/></triangl
         ("Träger Tröger Größe", "latin-1", "cp1252"),
         ("Écrou à œillet, Ø12", "cp1252", "cp1252"),
         ("螺栓_1 底板 M6螺母", "gb18030", "gb18030"),
+        ("轴", "gb18030", "gb18030"),
+        ("轴承座\n板", "gb18030", "gb18030"),
+        ("Пластина Болт М6 «А»", "cp1251", "cp1251"),
+        ("ОСНОВАНИЕ", "cp1251", "cp1251"),
+        ("プレート 部品1 支柱", "cp932", "cp932"),
+        ("表示板 ソレノイド", "cp932", "cp932"),
+        ("브라켓 하우징 커버", "cp949", "cp949"),
+        ("底座 立柱 定位塊", "big5", "big5"),
+        ("O’Ring – 45° créée", "cp1252", "cp1252"),
         ("底板 Träger", "utf-8", "utf-8"),
         ("Träger", "utf-8-sig", "utf-8-sig"),
         ("底板", "utf-16", "utf-16"),
@@ -41,6 +61,48 @@ def test_encodings_are_recognized(text: str, encoding: str, expected: str) -> No
     assert decode_text(data) == text
 
 
+@pytest.mark.parametrize(
+    ("encoding", "names"),
+    [
+        ("gb18030", ["底板", "定位块"]),
+        ("cp932", ["表示板", "ソケット"]),
+        ("cp1251", ["Основание", "Стойка"]),
+        ("latin-1", ["Träger", "Fuß"]),
+    ],
+)
+def test_names_of_step_in_bytes_of_an_encoding(encoding: str, names: list[str], tmp_path: Path) -> None:
+    parts = [StepPart(name, (10.0, 20.0, 30.0)) for name in ("first_name", "second_name")]
+    path = StepWriter().write(
+        tmp_path / "a.stp",
+        StepAssembly("a", [("first_name", parts[0], SHIFT), ("second_name", parts[1], QUARTER_TURN)]),
+    )
+    text = path.read_text().replace("first_name", names[0]).replace("second_name", names[1])
+    path.write_bytes(text.encode(encoding))
+    assert [component.name for component in load_cad(path).model.components] == names
+
+
+def test_decimal_commas_of_3mf_are_read(tmp_path: Path) -> None:
+    mesh = mesh_xml(*box((0.5, 0, 0), (10.5, 20, 30))).replace(".", ",")
+    move = 'transform="1 0 0 0 1 0 0 0 1 0,25 0 0"'
+    path = write_3mf(tmp_path / "a.3mf", f'<object id="1" name="a">{mesh}</object>', f'<item objectid="1" {move}/>')
+    cad = load_cad(path)
+    np.testing.assert_allclose(cad.model.bounds_in_model, [[0.75, 0, 0], [10.75, 20, 30]])
+    assert cad.notes == ("its numbers have decimal commas",)
+
+
+def test_commas_before_thousands_are_no_decimal_commas(tmp_path: Path) -> None:
+    mesh = MESH.replace('x="10.0"', 'x="1,010.0"')
+    path = write_3mf(tmp_path / "a.3mf", f'<object id="1" name="a">{mesh}</object>', '<item objectid="1"/>')
+    with pytest.raises(InputError, match=r"broken 3MF.*1\.010\.0"):
+        load_cad(path)
+
+
+def test_an_author_in_another_encoding_does_not_change_the_names() -> None:
+    data = "底板 定位块 立柱 螺栓 支架 轴承座\n".encode() + "Müller".encode("latin-1")
+    assert text_encoding(data) == "utf-8"
+    assert decode_text(data).startswith("底板 定位块 立柱 螺栓 支架 轴承座")
+
+
 def test_bytes_that_no_encoding_knows_stay_different() -> None:
     assert decode_text(b"a\x81b\xff") != decode_text(b"a\x8db\xff")
 
@@ -50,6 +112,8 @@ def test_bytes_that_no_encoding_knows_stay_different() -> None:
     [
         ("latin-1", ("Träger", "Tröger")),
         ("gb18030", ("支架", "底板")),
+        ("cp932", ("ブロック", "表示板")),
+        ("cp1251", ("Плита", "Стойка")),
         ("utf-8", ("支架", "Träger")),
         ("utf-8-sig", ("支架", "Träger")),
     ],
@@ -72,6 +136,28 @@ def test_names_that_are_there_twice_are_told(tmp_path: Path) -> None:
     cad = load_cad(tmp_path / "p.obj", "mm")
     assert [c.name for c in cad.model.components] == ["bolt", "bolt_2", "bolt_3"]
     assert cad.notes == ("2 more components are named 'bolt': called bolt_2, bolt_3",)
+
+
+@pytest.mark.parametrize("order", [(0, 1, 2, 3), (3, 1, 0, 2), (2, 3, 1, 0)])
+def test_numbers_of_equal_names_do_not_depend_on_the_order_of_the_file(order: tuple[int, ...], tmp_path: Path) -> None:
+    places = np.array([[0, 0, 0], [1e-5, 40, 0], [50, -1e-5, 0], [50 - 1e-5, 40, 0]])
+    text = "".join(obj_text("bolt", VERTICES + places[i], FACES, 8 * k) for k, i in enumerate(order))
+    (tmp_path / "p.obj").write_text(text)
+    (tmp_path / "part.toml").write_text(
+        '[part]\ncad = "p.obj"\nunit = "mm"\n[components.bolt_2]\nposition_tolerance_mm = 0.25\n'
+    )
+    part = load_part(tmp_path)
+    found = {c.name: c.bounds_in_model[0] for c in part.model.components}
+    for name, place in zip(["bolt", "bolt_2", "bolt_3", "bolt_4"], places, strict=True):
+        np.testing.assert_allclose(found[name], place, atol=1e-6)
+    told = [finding.text for finding in check_part(part).findings if "one name" in finding.text]
+    assert len(told) == 1 and sorted(told[0].partition("there: ")[2].split(", ")) == sorted(found)
+
+
+def test_equal_names_with_equal_settings_are_not_told(tmp_path: Path) -> None:
+    (tmp_path / "p.obj").write_text("".join(obj_text("bolt", VERTICES + 50 * i, FACES, 8 * i) for i in range(3)))
+    findings = check_part(load_part(tmp_path / "p.obj", "mm")).findings
+    assert not [finding for finding in findings if "numbered" in finding.text]
 
 
 def test_names_of_stl_solids_in_latin_1(tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """Components measured in simulated clouds of a small assembly, and what is said where there is nothing to measure."""
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -326,3 +327,54 @@ def test_a_cloud_too_large_for_one_piece_gives_the_same(cloud, model, monkeypatc
     surface = MeshSurface(vertices, faces)
     spread = [np.nanmedian(np.abs(surface.closest(p.points, 0.5).distances)) for p in (whole, pieces)]
     assert spread[1] == pytest.approx(spread[0], rel=0.2)
+
+
+def at_scale(model, part, cloud, photos, by):
+    """All of it, enlarged by a factor."""
+    larger = make_model(
+        "larger", tuple(replace(c, vertices_in_model=by * c.vertices_in_model) for c in model.components)
+    )
+    moved = [replace(p, cam_from_scan=p.cam_from_scan * np.array([[1.0, 1.0, 1.0, by]] * 4)) for p in photos]
+    moved = [replace(p, cam_from_scan=np.vstack([p.cam_from_scan[:3], [0, 0, 0, 1.0]])) for p in moved]
+    scaled = replace(cloud, points=cloud.points * by, sigma=(cloud.sigma * by).astype(np.float32))
+    return scaled, larger, replace(part, model=larger), moved
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("with_photos", [False, True])
+def test_a_small_part_is_measured_as_one_of_usual_size(model, part, photos, with_photos):
+    moves = {
+        POST: move_about(centre(model, POST), np.array([0, 0, 0, 1.0, 0, 0])),
+        BLOCK: move_about(centre(model, BLOCK), np.array([0, 0, np.deg2rad(1.5), 0, 0.6, 0])),
+    }
+    cloud = make_cloud(model, photos, moves, without=(NUT,), noise_mm=0.02)
+    by = 0.08  # 16 mm across
+    scaled, small, its_part, its_photos = at_scale(model, part, cloud, photos, by)
+    usual = by_name(measure_components_in_cloud(cloud, model, part, photos if with_photos else ()))
+    found = by_name(measure_components_in_cloud(scaled, small, its_part, its_photos if with_photos else ()))
+    assert found[NUT].is_missing and usual[NUT].is_missing
+    for name, truth in ((POST, [1.0, 0, 0]), (BLOCK, [0, 0.6, 0]), (TALL, [0, 0, 0])):
+        move = found[name]
+        assert isinstance(move, Move), move
+        np.testing.assert_allclose(move.displacement_mm, by * np.array(truth), atol=0.03 * by)
+        np.testing.assert_allclose(move.center_in_model, by * centre(model, name), atol=1e-9)
+        assert move.radius_mm == pytest.approx(by * usual[name].radius_mm)
+        assert 0.2 * by * 0.02 < move.residual_mm < 1.5 * by * 0.02
+        own, other = (np.sqrt(np.trace(one.covariance[3:, 3:])) for one in (move, usual[name]))
+        assert 0.3 * by * other < own < 0.002
+    assert np.rad2deg(found[BLOCK].twist[2]) == pytest.approx(1.5, abs=0.1)
+
+
+@pytest.mark.slow
+def test_points_that_are_far_apart(model, part, photos):
+    moves = {POST: move_about(centre(model, POST), np.array([0, 0, 0, 0.6, 0, 0]))}
+    cloud = make_cloud(model, photos, moves, spacing_mm=0.9, noise_mm=0.01)
+    coarse, large, its_part, _ = at_scale(model, part, cloud, photos, 4.0)  # 3.6 mm apart on a part of 800 mm
+    found = by_name(measure_components_in_cloud(coarse, large, its_part))
+    for name, truth in ((POST, [2.4, 0, 0]), (BLOCK, [0, 0, 0]), (NUT, [0, 0, 0])):
+        assert isinstance(found[name], Move), found[name]
+        np.testing.assert_allclose(found[name].displacement_mm, truth, atol=0.1)
+    sparse = make_cloud(model, photos, moves, spacing_mm=7.0, noise_mm=0.01)
+    found = by_name(measure_components_in_cloud(sparse, model, part))
+    assert isinstance(found[NUT], NotMeasured)
+    assert re.search(r"the points are too far apart for it, [5-9](\.\d)? mm: \d+ of them", found[NUT].reason)

@@ -107,3 +107,12 @@ def test_damaged_pages_are_skipped_and_counted(tmp_path: Path) -> None:
     (tmp_path / "b.tif").write_bytes(b"II*\0\x08\0\0\0")
     with pytest.raises(InputError, match=r"b\.tif: the picture cannot be read"):
         open_source(tmp_path / "b.tif")
+
+
+def test_frames_of_an_animated_png(tmp_path: Path) -> None:
+    path = write_pages(tmp_path / "a.png", [3, 9, 20], duration=100)
+    frames = list(open_source(path))
+    assert [level_of(frame.image) for frame in frames] == [3, 9, 20]
+    np.testing.assert_allclose([frame.time_s for frame in frames], [0.0, 0.1, 0.2], atol=1e-6)
+    still = write_pages(tmp_path / "b.png", [7])
+    assert [level_of(frame.image) for frame in open_source(still)] == [7]

@@ -205,7 +205,7 @@ def check_part(part: Part, camera: Camera | None = None) -> PartCheck:
         text = f"own symmetries were not searched, to save time, of {len(shapes.skipped)} components: "
         findings.append(PartFinding("note", text + listed(shapes.skipped, 4)))
     findings += [PartFinding("note", text) for text in untold_tolerances(part)]
-    findings += _hidden_findings(part)
+    findings += [*_number_findings(part), *_hidden_findings(part)]
     return PartCheck(
         part=part,
         camera=camera,
@@ -238,8 +238,7 @@ def _check_component(
 
 
 def _view_findings(part: Part, camera: Camera, view_range: ViewRange) -> list[PartFinding]:
-    findings = []
-    diameter_mm = part.model.diameter_mm
+    findings, diameter_mm = [], part.model.diameter_mm
     near_mm, far_mm = view_range.distance_mm
     if near_mm <= 0.5 * diameter_mm:
         findings.append(
@@ -259,8 +258,12 @@ def _view_findings(part: Part, camera: Camera, view_range: ViewRange) -> list[Pa
             )
         )
     if near_mm < MIN_TRACKED_MM:
-        text = f"the nearest distance is {near_mm:.2g} mm: detection and tracking need {MIN_TRACKED_MM:g} mm and more"
-        findings.append(PartFinding("problem", text))
+        findings.append(
+            PartFinding(
+                "problem",
+                f"the nearest distance is {near_mm:.2g} mm: detection and tracking need {MIN_TRACKED_MM:g} mm and more",
+            )
+        )
     across_px = camera.fx * diameter_mm / far_mm
     if part.view_range and across_px < 60.0:  # the default range ends there
         findings.append(
@@ -282,8 +285,11 @@ def _symmetry_findings(part: Part, view_range: ViewRange, symmetries: tuple[Foun
     findings = []
     for declared in part.symmetries:
         if not any(found.is_exact and _covers(found.symmetry, declared) for found in symmetries):
-            text = f"the declared symmetry of the part, {declared.describe()}, is not in its geometry"
-            findings.append(PartFinding("warning", text))
+            findings.append(
+                PartFinding(
+                    "warning", f"the declared symmetry of the part, {declared.describe()}, is not in its geometry"
+                )
+            )
     ambiguous, excluded = [], []
     near: dict[str, list[str]] = {}
     declared_ones = []
@@ -299,19 +305,23 @@ def _symmetry_findings(part: Part, view_range: ViewRange, symmetries: tuple[Foun
             same = 100.0 * (1.0 - found.unmatched_share)
             near.setdefault(_breaking_text(part, found), []).append(f"{what} ({same:.0f} % of its surface)")
     for told, rotations in near.items():
-        text = f"the part is nearly the same when rotated by {listed(rotations, 4)}{told}"
-        findings.append(PartFinding("warning", text))
+        findings.append(
+            PartFinding("warning", f"the part is nearly the same when rotated by {listed(rotations, 4)}{told}")
+        )
     if declared_ones:
         findings.append(PartFinding("note", f"the part is symmetric as declared: {listed(declared_ones, 4)}"))
     if ambiguous:
-        text = (
-            f"the part looks the same when rotated by {listed(ambiguous, 4)}: its pose is ambiguous; "
-            "restrict [view_range], declare it as [[symmetry]] if it does not matter, or rely on its texture"
+        findings.append(
+            PartFinding(
+                "problem",
+                f"the part looks the same when rotated by {listed(ambiguous, 4)}: its pose is ambiguous; "
+                "restrict [view_range], declare it as [[symmetry]] if it does not matter, or rely on its texture",
+            )
         )
-        findings.append(PartFinding("problem", text))
     if excluded:
-        text = f"symmetries and near-symmetries that the view range excludes: {listed(excluded, 4)}"
-        findings.append(PartFinding("note", text))
+        findings.append(
+            PartFinding("note", f"symmetries and near-symmetries that the view range excludes: {listed(excluded, 4)}")
+        )
     return findings
 
 
@@ -338,8 +348,7 @@ def can_confuse(symmetry: Symmetry, view_range: ViewRange) -> bool:
     directions = np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), z], axis=1)
     # Half the spacing of the directions as margin, so that a narrow range is not missed.
     directions = directions[view_range.contains_direction(directions, margin_deg=2.5)]
-    up = view_range.up_in_model
-    width_deg = view_range.roll_deg[1] - view_range.roll_deg[0]
+    up, width_deg = view_range.up_in_model, view_range.roll_deg[1] - view_range.roll_deg[0]
     for turn in range(1, symmetry.order):
         rotation = exp_so3(np.array(symmetry.axis_in_model) * (2.0 * np.pi * turn / symmetry.order))
         turned = directions @ rotation.T
@@ -364,8 +373,7 @@ def _angle_about_deg(axes: Array, start: Array, end: Array) -> Array:
 
 def _own_symmetry_findings(checks: tuple[ComponentCheck, ...], skipped: Sequence[str]) -> list[PartFinding]:
     """Inspected bodies of revolution without a declared symmetry, and declared symmetries missing in the geometry."""
-    findings = []
-    spinning = []
+    findings, spinning = [], []
     for check in checks:
         declared = check.settings.symmetry
         exact = [found.symmetry for found in check.symmetries]
@@ -377,8 +385,12 @@ def _own_symmetry_findings(checks: tuple[ComponentCheck, ...], skipped: Sequence
         if check.settings.role == "inspect" and declared is None and spins:
             spinning.append(f"{check.component.name} ({spins[0].describe().removeprefix('any angle about ')})")
     if spinning:
-        text = f"bodies of revolution, whose rotation about their axis cannot be measured: {listed(spinning, 8)}"
-        findings.append(PartFinding("note", text))
+        findings.append(
+            PartFinding(
+                "note",
+                f"bodies of revolution, whose rotation about their axis cannot be measured: {listed(spinning, 8)}",
+            )
+        )
     return findings
 
 
@@ -406,11 +418,30 @@ def _role_findings(part: Part) -> list[PartFinding]:
         findings.append(PartFinding("warning", text + "of all of them together, and none of them is judged"))
     for datum in part.datums:
         if bases and datum.component not in bases:
-            text = f"datum {datum.label} is on {datum.component}, which is not the base: its deviation moves the frame"
-            findings.append(PartFinding("warning", text))
+            findings.append(
+                PartFinding(
+                    "warning",
+                    f"datum {datum.label} is on {datum.component}, which is not the base: its deviation moves the "
+                    "frame",
+                )
+            )
     if not part.inspected:
         findings.append(PartFinding("warning", "no component has the role inspect: nothing is measured"))
     return findings
+
+
+def _number_findings(part: Part) -> list[PartFinding]:
+    """Components that the CAD gives one name, and the part file settings of their own by their numbers."""
+    groups: dict[str, list[ComponentSettings]] = {}
+    for settings, path in zip(part.settings, part.paths, strict=False):
+        if path and re.fullmatch(re.escape(path[-1]) + r"(_\d+)?", settings.name):
+            groups.setdefault(path[-1], []).append(settings)
+    told = [s.name for group in groups.values() if len({replace(s, name="") for s in group}) > 1 for s in group]
+    text = (
+        "the CAD gives these one name, so that they are numbered by their places (along x, then y, then z), and their "
+    )
+    text += "settings go to others when one is added, removed or moved past another; give them names of their own there"
+    return [PartFinding("warning", f"{text}: {listed(told, 6)}")] if told else []
 
 
 def _hidden_findings(part: Part) -> list[PartFinding]:

@@ -83,19 +83,37 @@ def size_remarks(
     near_mm, far_mm = distance_mm
     far_px, near_px = pixels_across
     if near_px < SMALL_PX:
-        text = f"is too small to be seen: {near_px:.1f} px across even at {near_mm:.0f} mm"
-        plural = f"are too small to be seen, {{low}} to {{high}} px across even at {near_mm:.0f} mm"
-        return [Remark("problem" if is_inspected else "warning", name, text, plural, near_px)]
+        return [
+            Remark(
+                "problem" if is_inspected else "warning",
+                name,
+                f"is too small to be seen: {near_px:.1f} px across even at {near_mm:.0f} mm",
+                f"are too small to be seen, {{low}} to {{high}} px across even at {near_mm:.0f} mm",
+                near_px,
+            )
+        ]
     if far_px < SMALL_PX:
         limit_mm = near_mm * near_px / SMALL_PX
-        text = f"is small: {far_px:.1f} px across at {far_mm:.0f} mm; large enough up to {limit_mm:.0f} mm"
-        plural = f"are small, {{low}} to {{high}} px across at {far_mm:.0f} mm, where {SMALL_PX:.0f} are needed"
-        return [Remark("warning", name, text, plural, far_px)]
+        return [
+            Remark(
+                "warning",
+                name,
+                f"is small: {far_px:.1f} px across at {far_mm:.0f} mm; large enough up to {limit_mm:.0f} mm",
+                f"are small, {{low}} to {{high}} px across at {far_mm:.0f} mm, where {SMALL_PX:.0f} are needed",
+                far_px,
+            )
+        ]
     thin_px = far_px * extents_mm[2] / extents_mm[1]
     if thin_px < THIN_PX:
-        text = f"is thin: {thin_px:.1f} px at {far_mm:.0f} mm when seen edge-on"
-        plural = f"are thin, {{low}} to {{high}} px at {far_mm:.0f} mm when seen edge-on"
-        return [Remark("note", name, text, plural, thin_px)]
+        return [
+            Remark(
+                "note",
+                name,
+                f"is thin: {thin_px:.1f} px at {far_mm:.0f} mm when seen edge-on",
+                f"are thin, {{low}} to {{high}} px at {far_mm:.0f} mm when seen edge-on",
+                thin_px,
+            )
+        ]
     return []
 
 
@@ -103,21 +121,39 @@ def mesh_remarks(name: str, fitness: MeshFitness) -> list[Remark]:
     """Whether the mesh of a component is a sheet, open, not a surface, or wound inconsistently."""
     remarks = []
     if fitness.thickness_mm < SHEET_FRACTION * fitness.extents_mm[0]:
-        text = f"is a sheet without thickness ({fitness.thickness_mm:.3g} mm): give it one in the CAD"
-        plural = "are sheets without thickness, give them one in the CAD"
-        remarks.append(Remark("warning", name, text, plural))
+        remarks.append(
+            Remark(
+                "warning",
+                name,
+                f"is a sheet without thickness ({fitness.thickness_mm:.3g} mm): give it one in the CAD",
+                "are sheets without thickness, give them one in the CAD",
+            )
+        )
     elif fitness.open_edge_count:
         count = fitness.open_edge_count
         edges = "1 open edge, which" if count == 1 else f"{count} open edges, which"
-        text = f"is not closed: {edges} will appear as {'a contour' if count == 1 else 'contours'}"
-        plural = "are not closed, {low} to {high} open edges each, which will appear as contours"
-        remarks.append(Remark("warning", name, text, plural, float(fitness.open_edge_count)))
+        remarks.append(
+            Remark(
+                "warning",
+                name,
+                f"is not closed: {edges} will appear as {'a contour' if count == 1 else 'contours'}",
+                "are not closed, {low} to {high} open edges each, which will appear as contours",
+                float(fitness.open_edge_count),
+            )
+        )
     if fitness.non_manifold_edge_count:
         count = fitness.non_manifold_edge_count
-        text = f"has {count} edge{'' if count == 1 else 's'} shared by more than two triangles (non-manifold)"
-        plural = "have edges shared by more than two triangles (non-manifold), {low} to {high} each"
-        remarks.append(Remark("warning", name, text, plural, float(count)))
+        remarks.append(
+            Remark(
+                "warning",
+                name,
+                f"has {count} edge{'' if count == 1 else 's'} shared by more than two triangles (non-manifold)",
+                "have edges shared by more than two triangles (non-manifold), {low} to {high} each",
+                float(count),
+            )
+        )
     if not fitness.is_consistent:
-        text = "has triangles that face the wrong way"
-        remarks.append(Remark("warning", name, text, "have triangles that face the wrong way"))
+        remarks.append(
+            Remark("warning", name, "has triangles that face the wrong way", "have triangles that face the wrong way")
+        )
     return remarks

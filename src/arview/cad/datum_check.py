@@ -42,8 +42,7 @@ class RoundEdge:
 def datum_problems(part: Part) -> list[str]:
     """A text for each datum plane, hole, pin or cylinder that is not where the part file has it."""
     rims: dict[str, list[RoundEdge]] = {}
-    texts = []
-    names = {component.name for component in part.model.components}
+    texts, names = [], {component.name for component in part.model.components}
     for datum in part.datums:
         if datum.component not in names:
             continue
@@ -110,8 +109,7 @@ def _fitted_rim(points: Array, round_share: float) -> RoundEdge | None:
 def _round_problem(datum: Datum, rims: list[RoundEdge]) -> str:
     point, axis = np.array(datum.point_in_model), np.array(datum.direction_in_model)
     diameter_mm = datum.diameter_mm or 0.0
-    radius_mm = 0.5 * diameter_mm
-    differences = []
+    radius_mm, differences = 0.5 * diameter_mm, []
     for rim in rims:
         offset = rim.center_in_model - point
         aside_mm = float(np.linalg.norm(offset - (offset @ axis) * axis))

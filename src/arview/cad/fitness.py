@@ -110,8 +110,7 @@ def face_areas(vertices: Array, faces: Faces) -> Array:
 
 def surface_moments(vertices: Array, faces: Faces) -> tuple[Array, Array]:
     """Centroid (3,) and covariance (3,3) of a surface of uniform density, exact."""
-    areas = face_areas(vertices, faces)
-    corners = vertices[faces]
+    areas, corners = face_areas(vertices, faces), vertices[faces]
     total = areas.sum()
     centroid = (areas[:, None] * corners.mean(axis=1)).sum(axis=0) / total
     local = corners - centroid
@@ -213,8 +212,7 @@ def _wind_outwards(vertices: Array, faces: Faces) -> Faces:
     low, high = np.full((len(closed), 3), np.inf), np.full((len(closed), 3), -np.inf)
     np.minimum.at(low, bodies, vertices[faces].min(axis=1))
     np.maximum.at(high, bodies, vertices[faces].max(axis=1))
-    outer = closed & (volumes > 0)
-    flip = closed & (volumes < 0)
+    outer, flip = closed & (volumes > 0), closed & (volumes < 0)
     for body in np.flatnonzero(flip):
         # A body that faces inwards is a cavity when it lies inside one that faces outwards.
         flip[body] = not np.any(outer & (low < low[body]).all(axis=1) & (high > high[body]).all(axis=1))
@@ -247,8 +245,7 @@ def _wind_alike(vertices: Array, faces: Faces) -> Faces:
     wanted += np.maximum(parents[:count], np.arange(count))
     found = np.minimum(np.searchsorted(keys[order], wanted), len(keys) - 1)
     flips = (is_opposed[order][found] & (keys[order][found] == wanted)).tolist()
-    turned = [False] * (count + 1)
-    parent_of = parents.tolist()
+    turned, parent_of = [False] * (count + 1), parents.tolist()
     for face in sequence[1:].tolist():
         turned[face] = turned[parent_of[face]] ^ flips[face]
     is_turned = np.array(turned[:count])

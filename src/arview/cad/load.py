@@ -38,7 +38,9 @@ READERS: dict[str, Callable[[Path], RawModel]] = {
     ".3mf": read_3mf,
 }
 """Readers by suffix; that of STEP takes tolerances, too."""
-_STEP_SUFFIXES = (".step", ".stp")
+_STEP_SUFFIXES = (".step", ".stp", ".stpz")
+_PACKED = (".zip", ".gz")
+"""Suffixes of archives, in which only STEP is read."""
 SUFFIXES = (*_STEP_SUFFIXES, *READERS)
 MIN_SIZE_MM, MAX_SIZE_MM = 1.0, 100_000.0
 """Range of the diameter of a part, for files whose unit may be wrong."""
@@ -88,7 +90,7 @@ def load_cad(
     """Read a CAD file: every mesh at its place in the file's root frame, in mm, under its own name.
 
     Args:
-        path: .step .stp .glb .gltf .obj .stl .ply .3mf.
+        path: .step .stp .stpz .glb .gltf .obj .stl .ply .3mf; STEP also as .gz or .zip.
         unit: "mm", "cm", "m" or "inch". Needed for OBJ, STL and PLY, which carry none. For the others it
             overrides the file's unit: the numbers in the file are then taken to be in ``unit``.
         tol_linear_mm: STEP only: largest distance of the triangles from the true surface, mm.
@@ -110,11 +112,12 @@ def load_cad(
         raise InputError(f"{path}: no such file")
     if not path.is_file():
         raise InputError(f"{path}: is not a file")
-    if suffix not in SUFFIXES and suffix[1:] not in find_plug_ins(PLUG_INS):
+    if suffix not in (*SUFFIXES, *_PACKED) and suffix[1:] not in find_plug_ins(PLUG_INS):
         raise InputError(f"{path}: CAD of type {suffix or '(none)'!s} is not read; give one of {' '.join(SUFFIXES)}")
     if unit is not None and unit not in UNIT_MM:
         raise InputError(f"unit {unit!r} is not known; give one of {', '.join(UNIT_MM)}")
     check_step_tolerances(tol_linear_mm, tol_angular_deg)
+    stem = Path(path.stem).stem if suffix in _PACKED else path.stem
     try:
         if path.stat().st_size == 0:
             raise InputError(f"{path}: the file is empty (0 bytes)")
@@ -126,7 +129,7 @@ def load_cad(
     if raw.triangle_count == 0:
         raise InputError(f"{path}: {'; '.join(raw.notes) or 'holds no triangles (empty, or points and lines only)'}")
     factor_mm = _unit_factor(raw, path, unit)
-    names, notes = unique_names([component.path for component in raw.components], path.stem)
+    names, notes = unique_names([component.path for component in raw.components], stem, _places(raw))
     components, paths = [], []
     empty: list[str] = []
     turned: list[str] = []
@@ -152,7 +155,7 @@ def load_cad(
             notes.append(f"{text}: {short_list(names_told)}")
     if not components:
         raise InputError(f"{path}: all triangles are degenerate (they have no area)")
-    model = make_model(path.stem, tuple(components))
+    model = make_model(stem, tuple(components))
     _check_size(model, path, unit is not None)
     return LoadedCad(model, factor_mm, tuple(raw.notes + notes), raw.up, tuple(paths))
 
@@ -170,7 +173,7 @@ def check_step_tolerances(tol_linear_mm: float, tol_angular_deg: float) -> None:
 
 
 def _read(path: Path, suffix: str, tol_linear_mm: float, tol_angular_deg: float, is_overridden: bool) -> RawModel:
-    if suffix in _STEP_SUFFIXES:
+    if suffix in (*_STEP_SUFFIXES, *_PACKED):
         return read_step(path, tol_linear_mm, tol_angular_deg, is_overridden)
     if suffix in READERS:
         return READERS[suffix](path)
@@ -179,8 +182,7 @@ def _read(path: Path, suffix: str, tol_linear_mm: float, tol_angular_deg: float,
 
 def _read_by_plug_in(path: Path, entry: EntryPoint) -> RawModel:
     """A file read by another package: pairs of a name and a `trimesh.Trimesh` in mm."""
-    read = load_plug_in(entry)
-    raw = RawModel(unit_mm=1.0)
+    read, raw = load_plug_in(entry), RawModel(unit_mm=1.0)
     try:
         for name, mesh in read(path):
             vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
@@ -198,6 +200,12 @@ def _check_finite(component: RawComponent, path: Path) -> None:
         name = "/".join(component.path) or path.stem
         total = len(component.vertices)
         raise InputError(f"{path}: {bad} of {total} vertices of {name!r} are NaN or infinite; export it again")
+
+
+def _places(raw: RawModel) -> Array:
+    """(C,3) middles of the bounding boxes of the components; zero for those without triangles."""
+    used = [mesh.vertices[np.unique(mesh.faces)] for mesh in raw.components]
+    return np.array([0.5 * (v.min(axis=0) + v.max(axis=0)) if len(v) else np.zeros(3) for v in used])
 
 
 def _bounding_size(raw: RawModel) -> Array:

@@ -169,7 +169,7 @@ def load_part(path: str | Path, unit: str | None = None) -> Part:
     if path.suffix.lower() != ".toml":
         cad = load_cad(path, unit)
         settings = tuple(ComponentSettings(component.name) for component in cad.model.components)
-        return Part(path.stem, path, path, cad.model, settings, up=cad.up, notes=cad.notes, paths=cad.paths)
+        return Part(cad.model.name, path, path, cad.model, settings, up=cad.up, notes=cad.notes, paths=cad.paths)
     try:
         text = path.read_bytes().decode("utf-8")
     except UnicodeDecodeError as error:
@@ -207,8 +207,7 @@ def _read_part(root: TomlTable, path: Path, unit: str | None, load: Callable[...
     root.finish()
     head = root.table("part", required=True)
     default_name = path.resolve().parent.name if path.stem == "part" else path.stem
-    name = head.line("name", default_name)
-    cad_path = path.parent / head.text("cad")
+    name, cad_path = head.line("name", default_name), path.parent / head.text("cad")
     own_unit = head.choice("unit", tuple(UNIT_MM), None)
     own_up = head.choice("up", UP_AXES, None)
     tol_linear_mm = head.positive("tol_linear_mm", 0.1)
@@ -388,8 +387,7 @@ def _read_symmetry(table: TomlTable, default_through: Vector) -> Symmetry:
 
 
 def _read_datums(tables: TomlTable, model: Model) -> tuple[Datum, ...]:
-    datums = []
-    names = [component.name for component in model.components]
+    datums, names = [], [component.name for component in model.components]
     for label in tables.content:
         table = tables.table(label)
         feature = cast(DatumFeature, table.choice("feature", DATUM_FEATURES, required=True))

@@ -68,8 +68,7 @@ def pick_features(component: Component, face: int, point_in_model: Array) -> lis
         raise InputError(f"{component.name}: no face {face}, it has {len(component.faces)}")
     point = np.asarray(point_in_model, dtype=np.float64)
     vertices, faces = component.vertices_in_model, component.faces.astype(np.int64)
-    normals = _normals(vertices, faces)
-    neighbours = _neighbours(faces)
+    normals, neighbours = _normals(vertices, faces), _neighbours(faces)
     reach_mm = NEAR_SHARE * float(np.linalg.norm(np.ptp(vertices, axis=0)))
     found = _rims(component, point, reach_mm)
     flat = _region(face, neighbours, normals, FLAT_DEG, normals[face])
@@ -147,8 +146,7 @@ def _cylinder(
     """The cylinder through the faces of a smooth region; None when they do not lie on one."""
     areas = face_areas(vertices, faces[smooth])
     _, _, axes = np.linalg.svd(normals[smooth] * np.sqrt(areas)[:, None], full_matrices=False)
-    axis = axes[2]
-    corners = vertices[np.unique(faces[smooth])]
+    axis, corners = axes[2], vertices[np.unique(faces[smooth])]
     flat = corners @ axes[:2].T
     center, radius = fit_circle(flat)
     if radius <= 0 or np.abs(np.hypot(*(flat - center).T) - radius).max() > ROUND_SHARE * radius:
@@ -236,8 +234,7 @@ def _edge(
     nearest = int(np.argmin(distance))
     if distance[nearest] > reach_mm:
         return None
-    direction = unit[nearest]
-    offset = np.concatenate([starts, ends]) - starts[nearest]
+    direction, offset = unit[nearest], np.concatenate([starts, ends]) - starts[nearest]
     collinear = np.linalg.norm(offset - (offset @ direction)[:, None] * direction, axis=1) < 1e-4 * length.max() + 1e-6
     places = (offset @ direction)[collinear]
     # A short piece of a polygon around a rim is no straight edge.

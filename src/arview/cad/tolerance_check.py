@@ -33,22 +33,38 @@ def tolerance_remarks(
     expected_u_mm = EXPECTED_U_PX * mm_per_px
     if tolerance_mm is not None and tolerance_mm > MAX_EXTENT_SHARE * extents_mm[0]:
         text = f"has a position_tolerance_mm of {tolerance_mm:g}, larger than itself ({extents_mm[0]:.3g} mm)"
-        plural = "have a position_tolerance_mm larger than themselves, {low} to {high} mm"
-        remarks.append(Remark("warning", settings.name, f"{text}: is it in another unit?", plural, tolerance_mm))
+        remarks.append(
+            Remark(
+                "warning",
+                settings.name,
+                f"{text}: is it in another unit?",
+                "have a position_tolerance_mm larger than themselves, {low} to {high} mm",
+                tolerance_mm,
+            )
+        )
     if angle_deg is not None and angle_deg > MAX_ANGLE_DEG:
-        text = f"has an angle_tolerance_deg of {angle_deg:g}, with which hardly any rotation fails"
-        plural = "have an angle_tolerance_deg of {low} to {high}, with which hardly any rotation fails"
-        remarks.append(Remark("warning", settings.name, text, plural, angle_deg))
+        remarks.append(
+            Remark(
+                "warning",
+                settings.name,
+                f"has an angle_tolerance_deg of {angle_deg:g}, with which hardly any rotation fails",
+                "have an angle_tolerance_deg of {low} to {high}, with which hardly any rotation fails",
+                angle_deg,
+            )
+        )
     if tolerance_mm is not None and tolerance_mm < expected_u_mm:
-        text = (
-            f"has a position_tolerance_mm of {tolerance_mm:g}, below the uncertainty to be expected of photos from the "
-            f"nearest distance, {expected_u_mm:.2g} mm: it will be undecided; come nearer or use a sharper camera"
+        remarks.append(
+            Remark(
+                "warning",
+                settings.name,
+                f"has a position_tolerance_mm of {tolerance_mm:g}, below the uncertainty to be expected of photos from "
+                f"the nearest distance, {expected_u_mm:.2g} mm: it will be undecided; come nearer or use a "
+                "sharper camera",
+                "have a position_tolerance_mm of {low} to {high}, below the uncertainty to be expected of photos from "
+                f"the nearest distance, {expected_u_mm:.2g} mm: they will be undecided",
+                tolerance_mm,
+            )
         )
-        plural = (
-            "have a position_tolerance_mm of {low} to {high}, below the uncertainty to be expected of photos from the "
-            f"nearest distance, {expected_u_mm:.2g} mm: they will be undecided"
-        )
-        remarks.append(Remark("warning", settings.name, text, plural, tolerance_mm))
     return remarks
 
 

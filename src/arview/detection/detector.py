@@ -117,6 +117,11 @@ class Detection:
     quality: float
     alternatives: tuple[Array, ...] = ()
 
+    def to_dict(self) -> dict[str, object]:
+        """The detection as JSON values, under the names of its attributes."""
+        others = [pose.tolist() for pose in self.alternatives]
+        return {"cam_from_model": self.cam_from_model.tolist(), "quality": self.quality, "alternatives": others}
+
 
 @dataclass(frozen=True)
 class RejectedHypothesis:

@@ -1,4 +1,4 @@
-"""The JSON document of an inspection: from the record to the document, and back."""
+"""The JSON document of an inspection: from the document to the record; back it is `Inspection.to_dict`."""
 
 from __future__ import annotations
 
@@ -13,10 +13,8 @@ from arview.inspection.details import (
     ForeignReport,
     Repeatability,
     from_json,
-    to_json,
 )
 from arview.inspection.record import (
-    SCHEMA_VERSION,
     ComponentDeviation,
     Finding,
     Inspection,
@@ -93,65 +91,3 @@ def component_from_entry(entry: dict[str, Any]) -> ComponentDeviation:
         presence=None if entry.get("presence") is None else MeasuredPresence(entry["presence"]),
         details=None if entry.get("details") is None else from_json(Details, entry["details"]),
     )
-
-
-def to_document(inspection: Inspection) -> dict[str, Any]:
-    """The inspection as the JSON document that `save_inspection` writes."""
-    source = inspection.provenance
-    software, options = dict(source.software), dict(source.options)
-    more: dict[str, Any] = {
-        "photos_hash": source.photos_hash,
-        "photos": source.photos,
-        "software": software,
-        "options": options,
-        "cpu_s": source.cpu_s,
-    }
-    document: dict[str, Any] = {
-        "schema_version": SCHEMA_VERSION,
-        "part": inspection.part,
-        "serial": inspection.serial,
-        "model_hash": inspection.model_hash,
-        "created": inspection.created.replace(tzinfo=None).isoformat() + "Z",
-        "components": [_to_entry(component) for component in inspection.components],
-        "provenance": {
-            "tool": source.tool,
-            "version": source.version,
-            "method": source.method,
-            "note": source.note,
-            **{key: value for key, value in more.items() if value},
-        },
-    }
-    if inspection.datum_system is not None:
-        document["datum_system"] = to_json(inspection.datum_system)
-    if inspection.warnings:
-        document["warnings"] = list(inspection.warnings)
-    if inspection.foreign_objects:
-        document["foreign_objects"] = to_json(inspection.foreign_objects)
-    if inspection.distance_map is not None:
-        document["distance_map"] = to_json(inspection.distance_map)
-    if inspection.repeatability is not None:
-        document["repeatability"] = to_json(inspection.repeatability)
-    return document
-
-
-def _to_entry(component: ComponentDeviation) -> dict[str, Any]:
-    entry: dict[str, Any] = {
-        "name": component.name,
-        "displacement_mm": list(component.displacement_mm),
-        "distance_mm": component.distance_mm,
-    }
-    if component.tilt_deg is not None or component.twist_deg is not None:
-        entry["rotation"] = {"tilt_deg": component.tilt_deg, "twist_deg": component.twist_deg}
-    entry |= {
-        "observable": list(component.observable),
-        "uncertainty_mm": component.uncertainty_mm,
-        "tolerance_mm": component.tolerance_mm,
-        "verdict": component.verdict.value,
-    }
-    if component.finding is not None:
-        entry["finding"] = component.finding.value
-    if component.presence is not None:
-        entry["presence"] = component.presence.value
-    if component.details is not None:
-        entry["details"] = to_json(component.details)
-    return entry

@@ -10,7 +10,7 @@ from arview.cad import Model
 from arview.core.checks import PATH, check_type
 from arview.core.durable import replace_durably
 from arview.errors import InputError, MismatchError, OutputError
-from arview.inspection.document import from_document, to_document
+from arview.inspection.document import from_document
 from arview.inspection.record import Inspection, model_faults
 from arview.inspection.validation import document_faults, summary_of
 
@@ -55,7 +55,7 @@ def save_inspection(inspection: Inspection, path: str | Path) -> None:
     """
     check_type(inspection, Inspection, "save_inspection: inspection")
     path = Path(path)
-    text = json.dumps(to_document(inspection), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+    text = json.dumps(inspection.to_dict(), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
     try:
         replace_durably(path, text.encode())
     except OSError as error:

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 from arview.errors import InputError
-from arview.inspection.document import to_document
 from arview.inspection.record import ComponentDeviation, Inspection
 
 _DECIMALS = 4
@@ -23,7 +22,7 @@ def content_hash(document: Any) -> str:
 
 def fingerprint(inspection: Inspection) -> str:
     """The fingerprint of the file that `save_inspection` writes for this inspection."""
-    return content_hash(to_document(inspection))
+    return content_hash(inspection.to_dict())
 
 
 def values_fingerprint(inspection: Inspection) -> str:

@@ -8,14 +8,24 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from enum import StrEnum
+from html import escape
+from typing import Any
 
 from arview.cad import Model
 from arview.errors import InputError, MismatchError
-from arview.inspection.details import DatumSystem, Details, DistanceReport, ForeignReport, Repeatability
+from arview.inspection.details import (
+    DatumSystem,
+    Details,
+    DistanceReport,
+    ForeignReport,
+    Repeatability,
+    to_json,
+)
 
 SCHEMA_VERSION = "1.2"
 READABLE_VERSIONS = ("1.0", "1.1", "1.2")
 
+_COLUMNS = ("distance_mm", "uncertainty_mm", "tolerance_mm", "tilt_deg", "twist_deg")
 _DISTANCE_SLACK_MM = 0.006
 """Tolerated difference between distance and displacement, which may both be rounded to 0.01 mm in a file."""
 
@@ -99,6 +109,29 @@ class ComponentDeviation:
         if self.finding is Finding.MISSING:
             return False
         return True if any(self.observable) or self.distance_mm is not None else None
+
+    def to_dict(self) -> dict[str, Any]:
+        """The entry of the component as JSON values, as in ``inspection.json``."""
+        entry: dict[str, Any] = {
+            "name": self.name,
+            "displacement_mm": list(self.displacement_mm),
+            "distance_mm": self.distance_mm,
+        }
+        if self.tilt_deg is not None or self.twist_deg is not None:
+            entry["rotation"] = {"tilt_deg": self.tilt_deg, "twist_deg": self.twist_deg}
+        entry |= {
+            "observable": list(self.observable),
+            "uncertainty_mm": self.uncertainty_mm,
+            "tolerance_mm": self.tolerance_mm,
+            "verdict": self.verdict.value,
+        }
+        if self.finding is not None:
+            entry["finding"] = self.finding.value
+        if self.presence is not None:
+            entry["presence"] = self.presence.value
+        if self.details is not None:
+            entry["details"] = to_json(self.details)
+        return entry
 
     @property
     def _determined_displacement(self) -> tuple[str, tuple[float | None, ...]]:
@@ -264,6 +297,63 @@ class Inspection:
         found = ", ".join(f"{count} {verdict}" for verdict, count in counts.most_common())
         return f"<Inspection {f'{self.part} {self.serial}'.rstrip()}: {found}>"
 
+    def to_dict(self) -> dict[str, Any]:
+        """The inspection as JSON values, as in ``inspection.json``."""
+        source = self.provenance
+        software, options = dict(source.software), dict(source.options)
+        more: dict[str, Any] = {
+            "photos_hash": source.photos_hash,
+            "photos": source.photos,
+            "software": software,
+            "options": options,
+            "cpu_s": source.cpu_s,
+        }
+        document: dict[str, Any] = {
+            "schema_version": SCHEMA_VERSION,
+            "part": self.part,
+            "serial": self.serial,
+            "model_hash": self.model_hash,
+            "created": self.created.replace(tzinfo=None).isoformat() + "Z",
+            "components": [component.to_dict() for component in self.components],
+            "provenance": {
+                "tool": source.tool,
+                "version": source.version,
+                "method": source.method,
+                "note": source.note,
+                **{key: value for key, value in more.items() if value},
+            },
+        }
+        if self.datum_system is not None:
+            document["datum_system"] = to_json(self.datum_system)
+        if self.warnings:
+            document["warnings"] = list(self.warnings)
+        if self.foreign_objects:
+            document["foreign_objects"] = to_json(self.foreign_objects)
+        if self.distance_map is not None:
+            document["distance_map"] = to_json(self.distance_map)
+        if self.repeatability is not None:
+            document["repeatability"] = to_json(self.repeatability)
+        return document
+
+    def to_table(self) -> list[dict[str, object]]:
+        """A row for each component, as a data frame takes them; what was not determined is None."""
+        return [
+            {
+                "component": one.name,
+                **dict(zip(("dx_mm", "dy_mm", "dz_mm"), one.displacement_mm, strict=True)),
+                **{name: getattr(one, name) for name in _COLUMNS},
+                "verdict": one.verdict.value,
+            }
+            for one in self.components
+        ]
+
+    def _repr_html_(self) -> str:
+        """The table, as notebooks show it."""
+        rows = self.to_table()
+        lines = [list(rows[0]) if rows else [], *([_cell(value) for value in row.values()] for row in rows)]
+        table = "".join(f"<tr>{''.join(f'<td>{cell}</td>' for cell in line)}</tr>" for line in lines)
+        return f"<p>{escape(f'{self.part} {self.serial}'.rstrip())}</p><table>{table}</table>"
+
     def find(self, name: str) -> ComponentDeviation | None:
         """The entry of the component with this name, or None if it was not inspected."""
         return next((component for component in self.components if component.name == name), None)
@@ -283,11 +373,15 @@ class Inspection:
             raise MismatchError(f"the inspection of {self.part!r} {'; it '.join(faults)}")
 
 
+def _cell(value: object) -> str:
+    """A value of the table as HTML, numbers to a micrometre."""
+    return "" if value is None else f"{value:.3f}" if isinstance(value, float) else escape(str(value))
+
+
 def model_faults(model_hash: object, names: Sequence[str], model: Model) -> list[str]:
     """Why an inspection with this hash and these components is not of the model, as predicates of "the inspection"."""
     known = {component.name for component in model.components}
-    unknown = sorted(set(names) - known)
-    faults = []
+    unknown, faults = sorted(set(names) - known), []
     if unknown:
         faults.append(f"names {', '.join(map(repr, unknown))}, which model {model.name!r} does not have")
     if model_hash != model.source_hash:

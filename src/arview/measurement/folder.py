@@ -13,6 +13,7 @@ from arview.cad import Model, Part
 from arview.camera import Camera
 from arview.core.extras import require
 from arview.errors import InputError
+from arview.measurement.cloud.enlarged import enlargement
 from arview.measurement.cloud.global_registration import find_model_in_cloud
 from arview.measurement.cloud.placing import cloud_in_mm, moved_to_model, orient_normals, place_cloud, scaled
 from arview.measurement.cloud.reading import (
@@ -205,11 +206,12 @@ def in_model_frame(reconstruction: MetricReconstruction, part: Part) -> MetricRe
         if units:
             unit = units[reconstruction.cloud_factors.index(factor)]
             warnings.append(f"the cloud is in {unit}: in this unit the part was found in it")
-    moved, turned = orient_normals(moved_to_model(cloud, found), part.model, _NORMALS_WITHIN_MM)
+    moved, turned = orient_normals(
+        moved_to_model(cloud, found), part.model, _NORMALS_WITHIN_MM / enlargement(part.model)
+    )
     if turned:
         warnings.append(turned)
-    evidence = scale.evidence
-    std = scale.scale_std
+    evidence, std = scale.evidence, scale.scale_std
     if scale.scale is not None and not reconstruction.sparse.photos:
         moved, std, note = _checked_scale(moved, part, reconstruction.rescales)
         warnings += [note] if note else []

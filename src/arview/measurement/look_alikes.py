@@ -50,8 +50,10 @@ def with_unsure_names(records: Sequence[ComponentDeviation], part: Part) -> tupl
         alike = [one for one in records if one.name in groups[record.name]]
         kinds = {(one.verdict, one.finding) for one in alike}
         if len(kinds) > 1:
-            note = f"it may be any of {', '.join(one.name for one in alike)}: the part fits in {len(turns)} ways alike"
-            record = _unsure(record, note)
+            record = _unsure(
+                record,
+                f"it may be any of {', '.join(one.name for one in alike)}: the part fits in {len(turns)} ways alike",
+            )
         found.append(record)
     return found, warnings
 

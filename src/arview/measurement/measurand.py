@@ -58,8 +58,7 @@ def measurand_of(name: str, part: Part) -> Measurand:
     Raises:
         InputError: the component has no such point; the message names the component.
     """
-    component = part.model.component(name)
-    settings = part.component_settings(name)
+    component, settings = part.model.component(name), part.component_settings(name)
     seat = seat_of(component, part.model)
     symmetries = symmetries_of(component, part)
     axis, axis_from = _own_axis(component, symmetries, seat)

@@ -55,10 +55,8 @@ def component_record(
     """Position of a component's stated point in the datum frame, with its verdict."""
     settings = part.component_settings(name)
     tolerance_mm = settings.position_tolerance_mm or options.tolerance_mm
-    component = part.model.component(name)
-    center = measurand.point_in_model
-    together = combined_of(measured)
-    nothing = (False,) * 6
+    component, center = part.model.component(name), measurand.point_in_model
+    together, nothing = combined_of(measured), (False,) * 6
     failures = tuple(MethodResult(f.method, reason=f.reason) for f in measured.failures)
     if together is None or any(f.is_missing for f in measured.failures if f.method != "cloud"):
         is_missing = any(f.is_missing for f in measured.failures)
@@ -159,8 +157,7 @@ def _verdict(
 
 def _unjudged(placed: MeasuredPlacement, free: Array, angle_tolerance_deg: float | None) -> list[str]:
     """Texts on the own axes along or about which a tolerance could not be judged."""
-    texts = []
-    hidden = placed.axes[~placed.own_observable[3:]]
+    texts, hidden = [], placed.axes[~placed.own_observable[3:]]
     if len(hidden):
         texts.append(f"the displacement along {' and '.join(_direction_text(axis) for axis in hidden)} is undetermined")
     turned = [

@@ -88,8 +88,7 @@ def measure(
 
 def _measure(reconstruction: MetricReconstruction, part: Part, options: MeasureOptions, tell: Progress) -> Inspection:
     """The steps of `measure`, on the rough frame of the reconstruction."""
-    began = time.process_time()
-    warnings = list(reconstruction.scale.warnings)
+    began, warnings = time.process_time(), list(reconstruction.scale.warnings)
     consistency = reconstruction.scale.consistency
     if not consistency.is_consistent:
         if not options.uses_inconsistent:

@@ -7,6 +7,7 @@ from arview.core.doors import lazy_door
 if TYPE_CHECKING:
     from arview.tracking.diagnosis import diagnose_search as diagnose_search
     from arview.tracking.estimate import Estimate as Estimate
+    from arview.tracking.estimate import PosePrior as PosePrior
     from arview.tracking.guide_pose import GUIDE_PREFIX as GUIDE_PREFIX
     from arview.tracking.self_calibration.estimator import FocalEstimate as FocalEstimate
     from arview.tracking.self_calibration.profile import keep_profile as keep_profile
@@ -23,7 +24,10 @@ __getattr__, __dir__, __all__ = lazy_door(
     __name__,
     {
         "diagnosis": ("diagnose_search",),
-        "estimate": ("Estimate",),
+        "estimate": (
+            "Estimate",
+            "PosePrior",
+        ),
         "guide_pose": ("GUIDE_PREFIX",),
         "self_calibration.estimator": ("FocalEstimate",),
         "self_calibration.profile": ("keep_profile",),

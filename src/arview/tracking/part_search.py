@@ -96,6 +96,7 @@ class PartSearch:
         memory: how the part looked while it was tracked.
         others: poses (4,4) of other specimens of the part, which are not taken for this one.
         covers: where other parts are, at which this one is searched for in every second round of searches only.
+        prior: (4,4) pose in this frame that is known from elsewhere, near which the part is searched for first.
 
     Raises:
         InputError: an initial or guide pose that is not a rigid transform.
@@ -125,6 +126,7 @@ class PartSearch:
         self._guide = None if guide_cam_from_model is None else check_rigid(guide_cam_from_model, "guide pose")
         self.others: tuple[Array, ...] = ()
         self.covers: tuple[CoveredPlace, ...] = ()
+        self.prior: Array | None = None
 
     @property
     def detector(self) -> Detector:
@@ -162,6 +164,8 @@ class PartSearch:
         if self._initial is not None:
             yield from self._at_initial_pose(image, state, self._initial)
             return
+        if self.prior is not None and (near := self._guided.find(image, self.prior)) is not None:
+            yield FoundPose(near.cam_from_model)
         if self._guide is not None and state.state == TrackingState.SEARCHING:
             yield from self._at_guide_pose(image, state, self._guide)
             return

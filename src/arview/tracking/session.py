@@ -22,9 +22,10 @@ from arview.camera import Camera
 from arview.core.messages import sentence
 from arview.errors import InputError
 from arview.fiducials import SerialNumbers
-from arview.geometry import Array
+from arview.geometry import Array, check_rigid
 from arview.guideviews import GuideViewSet
 from arview.pose import Pose, TrackingState
+from arview.tracking.estimate import PosePrior
 from arview.tracking.self_calibration.camera_estimate import CameraEstimate
 from arview.tracking.self_calibration.estimator import FocalEstimate
 from arview.tracking.self_calibration.focal_watch import FocalWatch
@@ -173,7 +174,12 @@ class TrackingSession:
             self.specimens[number or 0].confirm()
 
     def process(
-        self, image: NDArray[np.uint8], index: int | None = None, time_s: float | None = None
+        self,
+        image: NDArray[np.uint8],
+        index: int | None = None,
+        time_s: float | None = None,
+        *,
+        prior: PosePrior | None = None,
     ) -> tuple[Pose, ...]:
         """Pose and state of each specimen in the next frame.
 
@@ -181,19 +187,24 @@ class TrackingSession:
             image: (H,W,3) uint8 RGB of the camera's size.
             index: index of the frame, copied into the poses; default: the number of frames before it.
             time_s: time stamp of the frame, copied into the poses; default: since the first frame, by the clock.
+            prior: what a robot, a station or the phone itself knows of the pose of the only specimen in this frame. The
+                part is followed from there, too, and searched for there first; by the covariances the pose becomes the
+                mean of both, unless they contradict each other.
 
         Raises:
-            InputError: an image of another size or type.
+            InputError: an image of another size or type, or a prior that is no pose, or of which of several specimens
+                is not known.
         """
         self._began_s = time.monotonic() if self._began_s is None else self._began_s
         index = self._frames if index is None else index
+        prior = None if prior is None else self._checked_prior(prior)
         time_s = time.monotonic() - self._began_s if time_s is None else time_s
         searched = self._searched()
         # What is tracked comes first, because it is hidden from the search.
         examined = [*(number for number, one in enumerate(self.specimens) if one.has_pose), *searched]
         for number in examined:
             others, covers = self._others(number), self._covers(number)
-            pose = self.specimens[number].process(image, index, time_s, others, covers)
+            pose = self.specimens[number].process(image, index, time_s, others, covers, prior)
             self._poses[number] = replace(pose, instance=self._parts[number].name)
         for number in set(range(len(self.specimens))).difference(examined):
             self._poses[number] = self._waiting(number, index, time_s)
@@ -206,6 +217,20 @@ class TrackingSession:
             self._followed_frames[number] = self._followed_frames[number] + 1 if is_followed else 0
             self._missing_frames[number] = 0 if is_followed else self._missing_frames[number] + 1
         return tuple(self._poses[number] for number in range(len(self.specimens)))
+
+    def _checked_prior(self, prior: PosePrior) -> PosePrior:
+        """A prior as float64; raises InputError where it cannot be used."""
+        if len(self.specimens) > 1:
+            raise InputError("prior: several specimens are tracked, so that it is not known which one it is of")
+        pose, covariance = check_rigid(prior.cam_from_model, "prior"), prior.covariance
+        if covariance is not None:
+            covariance = np.asarray(covariance, dtype=np.float64)
+            is_sound = covariance.shape == (6, 6) and bool(np.isfinite(covariance).all())
+            if not is_sound or np.linalg.eigvalsh(covariance)[0] < 0.0:
+                raise InputError(
+                    "prior: its covariance must be 6×6 (rad, mm), finite and positive; leave it out instead"
+                )
+        return PosePrior(pose, covariance)
 
     def finish(self) -> FocalEstimate | None:
         """The estimate of a guessed camera from all frames, after the last one; None where it is not estimated."""

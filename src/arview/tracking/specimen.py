@@ -28,7 +28,7 @@ from arview.guideviews import GuideViewSet
 from arview.pose import Identity, Pose, TrackingState
 from arview.tracking.diagnosis import diagnose_loss
 from arview.tracking.disambiguation import HypothesisSet, RoundTurns
-from arview.tracking.estimate import Estimate
+from arview.tracking.estimate import Estimate, PosePrior
 from arview.tracking.identity import IdentityMonitor
 from arview.tracking.part_search import ALIGN, ALTERNATIVE_SHARE, FoundPose, PartSearch
 from arview.tracking.pose_recheck import LocalSearchRecheck
@@ -180,6 +180,7 @@ class SpecimenTracking:
         time_s: float,
         others: tuple[Array, ...] = (),
         covers: tuple[CoveredPlace, ...] = (),
+        prior: PosePrior | None = None,
     ) -> Pose:
         """Pose and state of the next frame.
 
@@ -189,6 +190,7 @@ class SpecimenTracking:
             time_s: time stamp of the frame, copied into the pose.
             others: poses (4,4) of other specimens of the part, which are not taken for this one.
             covers: where other parts are, at which this one is searched for in every second round of searches only.
+            prior: what is known of the pose in this frame from elsewhere.
 
         Raises:
             InputError: an image of another size or type.
@@ -196,6 +198,7 @@ class SpecimenTracking:
         started = time.perf_counter()
         image = self.frames.picture(image, index)
         self.search.others, self.search.covers = others, covers
+        self.search.prior = None if prior is None else prior.cam_from_model
         estimate, reason = self._follow(image) if self._state.has_pose else self._search(image)
         if estimate is not None:
             estimate, reason = self._disambiguate(image, estimate, reason)
@@ -220,10 +223,15 @@ class SpecimenTracking:
                 guide_cam_from_model=self.search.guide_pose(self._state),
             )
         pose, covariance = estimate.cam_from_model, self.tracker.covariance(estimate)
+        quality = self._quality(estimate, covariance)
+        if prior is not None:
+            body = pose @ self._part.model_from_body
+            body, covariance = prior.joined(body, self._part.body_from_model, covariance)
+            pose = body @ self._part.body_from_model
         return Pose(
             cam_from_model=pose,
             covariance=covariance,
-            quality=self._quality(estimate, covariance),
+            quality=quality,
             state=self.state,
             time_s=time_s,
             index=index,
@@ -262,7 +270,7 @@ class SpecimenTracking:
     def _follow(self, image: NDArray[np.uint8]) -> tuple[Estimate | None, str]:
         """Track the part into this frame; the reason says why the pose is weak or was given up."""
         s = self._state
-        estimate = self.tracker.track(image)
+        estimate = self.tracker.track(image, self.search.prior)
         is_possible = self.search.is_possible(estimate.cam_from_model)
         is_outside = estimate.evidence.points_in_picture < MIN_IN_PICTURE or not is_possible
         is_poor = is_outside or estimate.quality < LOST_QUALITY

@@ -191,13 +191,15 @@ class Tracker:
         state.usual_score, state.edge_support = evidence.score, evidence.contour_support
         self._choose_modalities()
 
-    def track(self, image: NDArray[np.uint8]) -> Estimate:
-        """Track the part into the next frame (H,W,3) uint8 RGB.
+    def track(self, image: NDArray[np.uint8], prior: Array | None = None) -> Estimate:
+        """Track the part into the next frame (H,W,3) uint8 RGB, in which a pose (4,4) may be known from elsewhere.
 
         Raises:
             RuntimeError: before `start`.
         """
         frame = self._prepare(image)
+        if prior is not None:
+            frame.prior = prior @ self.refiner.part.model_from_body
         for propose in (
             self._predicted,
             self._other_schedules,
@@ -235,7 +237,15 @@ class Tracker:
         # Wide schedules may lock on to a stronger edge nearby, so they are left for where the near one fails. So is a
         # start from texture alone, which carries the error of the pose at which the texture was learned.
         uses_edges = self.state.uses_edges
-        yield Proposal(frame.predicted, LAST_STAGES if uses_edges else STAGES, frame.matches, first_level=-1)
+        stages = LAST_STAGES if uses_edges else STAGES
+        yield Proposal(frame.predicted, stages, frame.matches, first_level=-1)
+        if frame.prior is not None:
+            frame.levels.cover([frame.prior])
+            yield Proposal(frame.prior, stages, None, first_level=-1)
+            # What was expected is that of both which came true: neither a jump that is known from elsewhere is unusual,
+            # nor the motion of a part whose prior is wrong.
+            if self._motion(frame, frame.found) > self._motion(frame, frame.found, frame.prior):
+                frame.predicted = frame.prior
 
     def _other_schedules(self, frame: FrameContext) -> Iterator[Proposal]:
         """Other schedules, where the scores are lower than usual."""
@@ -323,9 +333,10 @@ class Tracker:
             best -= penalty * self._motion(frame, frame.best)
         return score > best + proposal.min_gain
 
-    def _motion(self, frame: FrameContext, candidate: RefinedPose) -> float:
-        """Squared motion distance of a pose from the predicted one."""
-        return squared_motion_distance(candidate.cam_from_body, frame.predicted, self.diameter_mm)
+    def _motion(self, frame: FrameContext, candidate: RefinedPose, origin: Array | None = None) -> float:
+        """Squared motion distance of a pose from the predicted one, or from another one (4,4)."""
+        start = frame.predicted if origin is None else origin
+        return squared_motion_distance(candidate.cam_from_body, start, self.diameter_mm)
 
     def _is_unusual(self, frame: FrameContext) -> bool:
         """Whether the best pose differs from the predicted one more than usual, and than its covariance explains."""

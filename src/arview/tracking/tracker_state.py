@@ -107,6 +107,7 @@ class FrameContext:
         found_share: share of the expected texture that was found.
         best: the best pose so far; None before the first one.
         is_rechecked: whether the recheck was asked for.
+        prior: (4,4) pose that is known from elsewhere; None without one.
     """
 
     image: NDArray[np.uint8]
@@ -118,6 +119,7 @@ class FrameContext:
     found_share: float = 0.0
     best: RefinedPose | None = None
     is_rechecked: bool = False
+    prior: Array | None = None
 
     @property
     def found(self) -> RefinedPose:

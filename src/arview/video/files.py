@@ -148,8 +148,7 @@ class VideoFileSource(FrameSource):
 
     def _decoded(self, container: InputContainer, stream: VideoStream) -> Iterator[tuple[int, VideoFrame]]:
         """Index and frame of all frames that can be decoded; the others are counted in ``skipped``."""
-        index = 0
-        packets = container.demux(stream)
+        index, packets = 0, container.demux(stream)
         while True:
             try:
                 packet = next(packets, None)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -25,3 +26,7 @@ class Frame:
     index: int
     time_s: float
     file: str = ""
+
+    def _repr_png_(self) -> bytes:
+        """The picture, as notebooks show it."""
+        return bytes(cv2.imencode(".png", self.image[..., ::-1])[1])

@@ -115,11 +115,9 @@ class LiveSource(FrameSource):
             grabber.close()
 
     def _read_all(self, grabber: Grabber) -> None:
-        index = 0
-        first_s = 0.0
+        index, first_s = 0, 0.0
         while not self._closing:
-            image = grabber.read()
-            now_s = time.monotonic()
+            image, now_s = grabber.read(), time.monotonic()
             with self._changed:
                 self._arrived_s = now_s
                 if not self._opened and image is not None:

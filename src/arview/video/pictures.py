@@ -218,6 +218,12 @@ def pictures_among(paths: Iterable[Path]) -> list[Path]:
     )
 
 
+def is_film(path: Path) -> bool:
+    """Whether a picture is an animated PNG, which FFmpeg reads."""
+    with path.open("rb") as file:
+        return path.suffix.lower() == ".png" and b"acTL" in file.read(1 << 16).partition(b"IDAT")[0]
+
+
 def is_picture(path: Path) -> bool:
     """Whether a name ends as one of a picture; hidden files, such as ``._a.jpg`` of macOS, do not count."""
     return path.suffix.lower() in SUFFIXES and not path.name.startswith(".")

@@ -232,8 +232,7 @@ class VideoSink:
         origin_s: float | None = None
         sound: Iterator[Packet[AudioStream]] = iter(())
         waiting: Packet[AudioStream] | None = None
-        ticks = -1
-        frame_ticks = round(TICKS_PER_S / self._fps)
+        ticks, frame_ticks = -1, round(TICKS_PER_S / self._fps)
         for image, time_s in queued:
             if origin_s is None:
                 origin_s = time_s

@@ -14,6 +14,7 @@ from arview.video.live import CameraGrabber, LiveSource, UrlGrabber
 from arview.video.pictures import (
     SUFFIXES,
     PictureSource,
+    is_film,
     is_printf_pattern,
     paths_of_pattern,
     picture_paths,
@@ -53,8 +54,7 @@ def open_source(
         InputError: the source does not exist or cannot be read.
     """
     check_type(spec, PATH, "open_source: spec")
-    wanted = FrameRange(start or 0, end, stride)
-    text = str(spec)
+    wanted, text = FrameRange(start or 0, end, stride), str(spec)
     if not 0 < fps < float("inf"):
         raise InputError(f"fps {fps}: expected a positive number of frames per second")
     path = Path(text.removeprefix("file://"))
@@ -82,7 +82,7 @@ def open_source(
             raise InputError(f"{path}: the folder contains no pictures ({_suffixes()}); give another folder or file")
         return PictureSource(text, pictures, wanted, fps)
     if path.exists():
-        if path.suffix.lower() in SUFFIXES:
+        if path.suffix.lower() in SUFFIXES and not is_film(path):
             return PictureSource(text, [path], wanted, fps)
         return VideoFileSource(path, wanted)
     if is_printf_pattern(text):

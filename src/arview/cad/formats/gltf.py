@@ -1,8 +1,8 @@
 """Reader of glTF 2.0 (.glb, .gltf): named nodes, nested transforms, instances, colours.
 
 Source: Khronos glTF 2.0 specification, EXT_mesh_gpu_instancing, KHR_mesh_quantization, EXT_meshopt_compression,
-KHR_draco_mesh_compression. Written for CAD, so that every node that carries a mesh stays one component under its own
-name; skins, morph targets and textures are ignored.
+KHR_draco_mesh_compression, KHR_node_visibility. Written for CAD, so that every node that carries a mesh stays one
+component under its own name; skins, morph targets and textures are ignored.
 """
 
 from __future__ import annotations
@@ -18,7 +18,16 @@ from numpy.typing import NDArray
 
 from arview.cad.formats import draco
 from arview.cad.formats.gltf_data import GltfData
-from arview.cad.formats.raw import RawComponent, RawModel, check_instance_count, check_triangle_count, unit_in_mm
+from arview.cad.formats.raw import (
+    LEFT_OUT_HIDDEN,
+    RawComponent,
+    RawModel,
+    check_instance_count,
+    check_triangle_count,
+    short_list,
+    unit_in_mm,
+)
+from arview.cad.formats.text_encoding import decode_text
 from arview.errors import InputError
 from arview.geometry import Array
 
@@ -26,7 +35,14 @@ _COMPRESSED = {
     draco.EXTENSION: "Draco compression",
     "KHR_meshopt_compression": "meshopt compression",
 }
-_SUPPORTED = ("KHR_mesh_quantization", "EXT_mesh_gpu_instancing", "EXT_meshopt_compression", draco.EXTENSION)
+_VISIBILITY = "KHR_node_visibility"
+_SUPPORTED = (
+    "KHR_mesh_quantization",
+    "EXT_mesh_gpu_instancing",
+    "EXT_meshopt_compression",
+    draco.EXTENSION,
+    _VISIBILITY,
+)
 _WITHOUT_GEOMETRY = ("KHR_materials_", "KHR_texture_", "EXT_texture_", "MSFT_texture_", "KHR_lights_", "KHR_xmp_")
 """Beginnings of the names of extensions that concern appearance only."""
 _MAX_DEPTH = 200
@@ -88,7 +104,7 @@ class _Gltf:
                 offset += 8 + size
         elif path.suffix.lower() == ".glb":
             raise InputError(f"{path}: not a GLB file (its first bytes are {data[:4]!r}, expected b'glTF')")
-        self.tree: dict[str, Any] = json.loads(text)
+        self.tree: dict[str, Any] = json.loads(decode_text(text))
         if not str(self.tree["asset"]["version"]).startswith("2."):
             raise InputError(f"{path}: glTF version {self.tree['asset']['version']}; only 2 is supported")
         _check_extensions(self.tree, path)
@@ -96,10 +112,10 @@ class _Gltf:
         self.model = RawModel(unit_mm=1000.0)
         self.meshes: dict[int, RawComponent | None] = {}
         self.visit_count = 0
+        self.hidden: list[str] = []
 
     def read(self) -> RawModel:
-        nodes = self.tree.get("nodes", [])
-        scenes = self.tree.get("scenes", [])
+        nodes, scenes = self.tree.get("nodes", []), self.tree.get("scenes", [])
         if scenes:
             roots = scenes[self.tree.get("scene", 0)].get("nodes", [])
         else:
@@ -108,6 +124,8 @@ class _Gltf:
         for root in roots:
             self._visit(root, np.eye(4), ())
         self._read_conventions()
+        if self.hidden:
+            self.model.notes.append(f"{LEFT_OUT_HIDDEN % 'glTF'}: {short_list(self.hidden)}")
         return self.model
 
     def _visit(self, index: int, root_from_parent: Array, path: tuple[str, ...]) -> None:
@@ -120,6 +138,9 @@ class _Gltf:
         if not name and "mesh" in node:
             name = str(self.tree["meshes"][node["mesh"]].get("name") or "")
         here = (*path, name)
+        if _is_hidden(node):
+            self.hidden.append(next((text for text in reversed(here) if text), "unnamed"))
+            return
         root_from_node = root_from_parent @ _node_matrix(node)
         if "mesh" in node:
             self._add_instances(node, root_from_node, here)
@@ -206,8 +227,7 @@ class _Gltf:
 
     def _color(self, primitive: dict[str, Any], decoded: draco.DracoMesh | None) -> Color | None:
         """Base colour of a primitive's material, times its mean vertex colour, as sRGB."""
-        linear = np.ones(3)
-        known = False
+        linear, known = np.ones(3), False
         if "material" in primitive:
             pbr = self.tree["materials"][primitive["material"]].get("pbrMetallicRoughness", {})
             known = "baseColorFactor" in pbr or "baseColorTexture" not in pbr
@@ -244,6 +264,13 @@ def _check_extensions(tree: dict[str, Any], path: Path) -> None:
     if missing:
         told = ", ".join(f"{_COMPRESSED[name]} ({name})" if name in _COMPRESSED else name for name in missing)
         raise InputError(f"{path}: requires {told}, which is not read; export it without")
+
+
+def _is_hidden(node: dict[str, Any]) -> bool:
+    """Whether a node is hidden with all below it, by the extension or by the custom data of exporters."""
+    told = {**node["extras"]} if isinstance(node.get("extras"), dict) else {}
+    own = node.get("extensions", {}).get(_VISIBILITY, {})
+    return own.get("visible") is False or told.get("visible") is False or told.get("hidden") is True
 
 
 def _node_matrix(node: dict[str, Any]) -> Array:

@@ -51,11 +51,9 @@ def _attributes(data: Bytes, count: int, stride: int) -> Bytes:
         raise ValueError(f"meshopt: elements of {stride} bytes in {len(data)} bytes")
     if data[0] != 0xA0:
         raise ValueError(f"meshopt: attributes of version {data[0]:#x}, expected 0xa0")
-    end = len(data) - max(stride, 32)
-    last = data[len(data) - stride :]
+    end, last = len(data) - max(stride, 32), data[len(data) - stride :]
     block = min((_BLOCK_BYTES // stride) & ~15, _BLOCK_ELEMENTS)
-    result = np.empty((count, stride), dtype=np.uint8)
-    at = 1
+    result, at = np.empty((count, stride), dtype=np.uint8), 1
     for start in range(0, count, block):
         size = min(block, count - start)
         for k in range(stride):
@@ -79,8 +77,7 @@ def _byte_deltas(data: Bytes, at: int, end: int, size: int) -> tuple[Bytes, int]
         code = (int(codes[group // 4]) >> (2 * (group % 4))) & 3
         if code == 0:
             continue
-        here = slice(group * _GROUP, (group + 1) * _GROUP)
-        bits = 1 << code
+        here, bits = slice(group * _GROUP, (group + 1) * _GROUP), 1 << code
         packed = data[at : at + 2 * bits]
         at += 2 * bits
         if at > end:
@@ -156,8 +153,7 @@ def _triangles(data: bytes, count: int) -> list[int]:
     relative_from = 13 if data[0] == 0xE1 else 15
     state = _TriangleState()
     numbers = _VarInts(data, 1 + count // 3, len(data) - 16)
-    table = data[len(data) - 16 :]
-    last = 0
+    table, last = data[len(data) - 16 :], 0
     result: list[int] = []
     for code in data[1 : 1 + count // 3]:
         if code < 0xF0:
@@ -207,8 +203,7 @@ def _sequence(data: bytes, count: int) -> list[int]:
     """Indices (count,) in any order: differences to one of two values before."""
     if len(data) < 1 + count + 4 or data[0] not in (0xD0, 0xD1):
         raise ValueError(f"meshopt: {count} indices in {len(data)} bytes")
-    numbers = _VarInts(data, 1, len(data) - 4)
-    before = [0, 0]
+    numbers, before = _VarInts(data, 1, len(data) - 4), [0, 0]
     result = []
     for _ in range(count):
         value = numbers.next()
@@ -235,8 +230,7 @@ def _quaternions(stored: NDArray[Any]) -> Array:
     largest = stored[:, 3] & 3
     parts = stored[:, :3] / np.sqrt(2.0) / (stored[:, 3:] | 3)
     rest = np.sqrt(np.maximum(0.0, 1.0 - (parts**2).sum(axis=1)))
-    result = np.empty((len(stored), 4))
-    rows = np.arange(len(stored))
+    result, rows = np.empty((len(stored), 4)), np.arange(len(stored))
     for k, part in enumerate((rest, *parts.T)):
         result[rows, (largest + k) & 3] = part
     return np.round(result * 32767.0)

@@ -44,8 +44,7 @@ def read_obj(path: Path) -> RawModel:
     groups: list[_Group] = [_Group("")]
     group_of_name: dict[str, _Group] = {}
     materials: dict[str, Color] = {}
-    material = ""
-    squares = 0
+    material, squares = "", 0
     for number, line in enumerate(lines, start=1):
         words = line.split()
         if not words or words[0].startswith("#"):
@@ -123,8 +122,7 @@ def _read_materials(obj_path: Path, name: str, encoding: str) -> dict[str, Color
     if not path.is_relative_to(folder) or not path.is_file():
         return colors
     data = path.read_bytes()
-    own = text_encoding(data)
-    name = ""
+    own, name = text_encoding(data), ""
     for line in _LINE_END.split(decode_text(data, own if own == "utf-8" else encoding)):
         words = line.split()
         if words[:1] == ["newmtl"]:

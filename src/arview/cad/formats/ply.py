@@ -36,8 +36,7 @@ def read_ply(path: Path) -> RawModel:
         faces = np.asarray(getattr(mesh, "faces", []), dtype=np.int64).reshape(-1, 3)
         if len(faces) == 0:
             continue
-        vertices = np.asarray(mesh.vertices, dtype=np.float64)
-        color = None
+        vertices, color = np.asarray(mesh.vertices, dtype=np.float64), None
         if mesh.visual.kind in ("vertex", "face"):
             colors = mesh.visual.vertex_colors if mesh.visual.kind == "vertex" else mesh.visual.face_colors
             red, green, blue = np.asarray(colors, dtype=np.float64)[:, :3].mean(axis=0) / 255.0

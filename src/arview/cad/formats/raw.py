@@ -20,8 +20,13 @@ MAX_TRIANGLES = 5_000_000
 MAX_INSTANCES = 10_000
 """Largest number of components and assemblies of a file, each counted as often as it is placed."""
 
+SAME_PLACE = 1e-3
+"""Difference of coordinates, as a share of what equal components span, below which these are taken for the same."""
+
 UNIT_MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "inch": 25.4}
 """Units that a user may name, in mm."""
+
+LEFT_OUT_HIDDEN = "left out, because the %s file hides them (show and export them to have them)"
 
 _ALIASES_MM = {
     "micron": 0.001,
@@ -127,11 +132,19 @@ def short_list(names: Sequence[str]) -> str:
     return ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
 
 
-def unique_names(paths: list[tuple[str, ...]], fallback: str) -> tuple[list[str], list[str]]:
+def unique_names(
+    paths: list[tuple[str, ...]], fallback: str, places: Array | None = None
+) -> tuple[list[str], list[str]]:
     """A unique name for every name path, and a note for each name that had to be changed.
 
     The last name of a path is used when no other component has it. Otherwise as many parents are prepended
-    (``sub_1/post``) as distinguish all components of that name, or they are numbered in the order of the file.
+    (``sub_1/post``) as distinguish all components of that name, or they are numbered by their places, which stay when
+    the CAD is exported again, as the order of the file need not.
+
+    Args:
+        paths: names of each component from the root on.
+        fallback: name of components without any.
+        places: (C,3) of the components, in any unit; None for the order of the file.
     """
     printable = [tuple(_printable(name) for name in path) for path in paths]
     notes: list[str] = []
@@ -154,7 +167,8 @@ def unique_names(paths: list[tuple[str, ...]], fallback: str) -> tuple[list[str]
     given = set(names)
     last_number: dict[str, int] = {}
     renamed: dict[str, list[str]] = {}
-    for i, name in enumerate(names):
+    for i in (i for same in indices.values() for i in (same if places is None else _by_place(same, places))):
+        name = names[i]
         number, unique = last_number.get(name, 1), name
         while unique in taken or (number > 1 and unique in given):
             number += 1
@@ -168,3 +182,13 @@ def unique_names(paths: list[tuple[str, ...]], fallback: str) -> tuple[list[str]
         which = f"{len(others)} more components are" if len(others) > 1 else "another component is"
         notes.append(f"{which} named {name!r}: called {short_list(others)}")
     return names, notes
+
+
+def _by_place(indices: list[int], places: Array) -> list[int]:
+    """Indices of components in the order of their places along x, y and z, whatever the noise of an export is."""
+    points = places[indices]
+    order = np.argsort(points, axis=0, kind="stable")
+    ranked = np.take_along_axis(points, order, axis=0)
+    steps = np.diff(ranked, axis=0, prepend=ranked[:1]) > SAME_PLACE * np.ptp(points, axis=0).max()
+    levels = np.take_along_axis(np.cumsum(steps, axis=0), np.argsort(order, axis=0), axis=0)
+    return [indices[k] for k in np.lexsort(levels.T[::-1])]

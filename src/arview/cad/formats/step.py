@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from arview.cad.formats.archive import unpacked
 from arview.cad.formats.gltf import parse_gltf
 from arview.cad.formats.limited_process import HUNG, IDLE_S, TIMED_OUT, ProcessLimits, run_limited
 from arview.cad.formats.raw import RawModel
@@ -42,7 +43,7 @@ def read_step(
     """Components of a STEP file: its products and, where a product has several named solids, those.
 
     Args:
-        path: of the file.
+        path: of the file, which may be packed by gzip or zip.
         tol_linear_mm: largest distance of the triangles from the surface, mm, whatever the unit of the file.
         tol_angular_deg: largest angle between neighbouring triangles, deg.
         is_overridden: return the numbers of the file, because their unit is given by the user.
@@ -51,7 +52,7 @@ def read_step(
     Raises:
         InputError: a broken or truncated file, or one that takes too much time or memory.
     """
-    data = path.read_bytes()
+    data = unpacked(path)
     prepared, notes = prepare_step(data, path)
     raw = parse_gltf(_triangulated(prepared, path, tol_linear_mm, tol_angular_deg, limits), path)
     raw.up = "z"

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path, PureWindowsPath
 
+from arview.cad.formats.archive import STEP_SUFFIXES
 from arview.cad.formats.step_statements import (
     DEFINITION,
     PLACEMENT,
@@ -24,7 +25,7 @@ from arview.cad.formats.step_statements import (
 )
 from arview.errors import InputError
 
-SUFFIXES = (".step", ".stp", ".p21")
+SUFFIXES = (*STEP_SUFFIXES, ".stpz")
 MAX_BYTES = 500_000_000
 """Largest size of an assembly with all its files: files that use others twice multiply."""
 _MAX_DEPTH = 30
@@ -50,8 +51,7 @@ def products_without_shape(data: bytes) -> dict[bytes, bytes]:
     if not uses:
         return {}
     parents = {parent for parent, _ in uses}
-    placements = {m[1] for m in PLACEMENT.finditer(data)}
-    products = Products(data)
+    placements, products = {m[1] for m in PLACEMENT.finditer(data)}, Products(data)
     items = {m[1]: set(re.findall(rb"\d+", m[3])) for m in SHAPE.finditer(data)}
     # A representation of nothing but its own frame stands for a shape in another file.
     empty = {one for one, held in items.items() if held <= placements and one not in products.linked}
@@ -128,8 +128,7 @@ def _files_of(data: bytes, definitions: dict[bytes, bytes]) -> dict[bytes, str]:
 
 def _beside(path: Path, name: str) -> Path | None:
     """A STEP file of a name beside another one or below; None without one, so that no other file is ever read."""
-    folder = path.resolve().parent
-    parts = PureWindowsPath(name).parts
+    folder, parts = path.resolve().parent, PureWindowsPath(name).parts
     for wanted in (parts, parts[-1:]):
         file = folder.joinpath(*wanted).resolve()
         if not file.is_file() and file.parent.is_dir():
@@ -141,8 +140,7 @@ def _beside(path: Path, name: str) -> Path | None:
 
 def _root(data: bytes) -> tuple[bytes, bytes] | None:
     """The definition of the only product of a file that no other uses, and its shape; None without just one."""
-    products = Products(data)
-    used = {m[6] for m in USE.finditer(data)}
+    products, used = Products(data), {m[6] for m in USE.finditer(data)}
     roots: dict[bytes, bytes] = {}
     for match in SHAPE_OF.finditer(data):
         definition = products.definition.get(match[1], b"")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-from arview.cad.formats.raw import short_list
+from arview.cad.formats.raw import LEFT_OUT_HIDDEN, short_list
 from arview.cad.formats.step_statements import (
     REF,
     SHAPE,
@@ -101,7 +101,7 @@ def hide_bodies(data: bytes) -> tuple[bytes, list[str]]:
         names.append(plain_name(use[3]) or plain_name(products.name_of(use[6])))
         edits[use.start(3), use.end(4)] = b"'%s',''" % HIDDEN.encode()
     told = short_list([name.decode("utf-8", errors="replace") for name in dict.fromkeys(names)])
-    notes = [f"left out, because the STEP file hides them (show and export them to have them): {told}"] if names else []
+    notes = [f"{LEFT_OUT_HIDDEN % 'STEP'}: {told}"] if names else []
     if deep:
         notes.append(f"{deep} bodies are hidden at one place of an assembly alone, and are kept")
     return edited(data, edits), notes

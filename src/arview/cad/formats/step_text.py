@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from arview.cad.formats.archive import unpacked
 from arview.cad.formats.raw import check_instance_count, short_list, unit_in_mm
 from arview.cad.formats.step_external import OtherFiles, products_without_shape
 from arview.cad.formats.step_scene import drop_repeated, hide_bodies, name_uses
@@ -21,7 +22,7 @@ from arview.cad.formats.step_statements import (
     Products,
     plain_name,
 )
-from arview.cad.formats.text_encoding import decode_text, text_encoding
+from arview.cad.formats.text_encoding import decode_text
 from arview.errors import InputError
 
 _MAX_NESTING = 64
@@ -36,7 +37,7 @@ def prepare_step(data: bytes, path: Path) -> tuple[bytes, list[str]]:
     Raises:
         InputError: not STEP, parentheses that never close, an assembly in itself, or too many components.
     """
-    others = OtherFiles(lambda file: _checked_text(file.read_bytes(), file))
+    others = OtherFiles(lambda file: _checked_text(unpacked(file), file))
     data = others.added(_checked_text(data, path), path)
     _check_instances(data, path)
     notes, products = list[str](), Products(data)
@@ -75,8 +76,7 @@ def _checked_text(data: bytes, path: Path) -> bytes:
     if b"ISO-10303-21" not in data[:4096]:
         raise InputError(f"{path}: not a STEP file (ISO-10303-21 is missing at its start)")
     _check_whole(data, path)
-    encoding = text_encoding(data)
-    return data if encoding == "utf-8" else decode_text(data, encoding).encode("utf-8")
+    return data if data.isascii() else decode_text(data).encode("utf-8")
 
 
 def _check_whole(data: bytes, path: Path) -> None:

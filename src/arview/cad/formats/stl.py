@@ -79,8 +79,7 @@ def _text(data: bytes, path: Path) -> RawModel:
 def _corners(data: bytes, start: int, end: int, path: Path) -> Array:
     """(3F,3) corners of the triangles between two places of a text file."""
     # An array of numbers, because a list of words would take ten times the memory.
-    numbers = array("d")
-    facets = 0
+    numbers, facets = array("d"), 0
     for loop in _LOOP.finditer(data, start, end):
         corners = _VERTEX.findall(loop[1])
         if len(corners) != 3:

@@ -28,6 +28,7 @@ from arview.cad.formats.raw import (
     short_list,
     unit_in_mm,
 )
+from arview.cad.formats.text_encoding import COMMAS
 from arview.errors import InputError
 from arview.geometry import Array
 
@@ -125,6 +126,12 @@ class _Archive:
             if told:
                 self.model.notes.append(f"{text}: {short_list(list(told))}")
         return self.model
+
+    def number(self, text: str) -> float:
+        """A number, which some programs write with a decimal comma; none is a comma before thousands and a point."""
+        if "," in text and COMMAS not in self.model.notes:
+            self.model.notes.append(COMMAS)
+        return float(text.replace(",", "."))
 
     def _main_part(self, names: list[str]) -> str:
         """Name of the 3D model part: by the relationships of the package, else the only candidate."""
@@ -230,7 +237,7 @@ class _ModelPart:
 
     def start(self, tag: str, attributes: Attributes) -> None:
         if tag == "vertex" and self.attributes is not None:
-            self.points.extend((float(attributes["x"]), float(attributes["y"]), float(attributes["z"])))
+            self.points.extend(map(self.archive.number, (attributes["x"], attributes["y"], attributes["z"])))
             if len(self.points) > 9 * MAX_TRIANGLES:
                 check_triangle_count(MAX_TRIANGLES + 1, self.archive.path)
         elif tag == "triangle" and self.attributes is not None:
@@ -242,7 +249,7 @@ class _ModelPart:
             use = (attributes.get("pid", own.get("pid")), attributes.get("p1", own.get("pindex")))
             self.uses[use] = self.uses.get(use, 0) + 1
         elif tag == "component" and self.attributes is not None:
-            self.children.append((self._key(attributes), _transform(attributes)))
+            self.children.append((self._key(attributes), self._transform(attributes)))
         elif tag == "object":
             self._clear()
             self.attributes = attributes
@@ -253,7 +260,7 @@ class _ModelPart:
         elif tag == "color":
             self.group.append(_color(attributes["color"]))
         elif tag == "item":
-            self.items.append((self._key(attributes), _transform(attributes), attributes.get("partnumber")))
+            self.items.append((self._key(attributes), self._transform(attributes), attributes.get("partnumber")))
         elif tag == "model":
             self.unit = attributes.get("unit", "millimeter")
 
@@ -273,6 +280,15 @@ class _ModelPart:
         )
         self._clear()
 
+    def _transform(self, attributes: Attributes) -> Array:
+        """(4,4) parent_from_object of a ``transform`` attribute: 12 numbers, rows of a row-vector matrix."""
+        matrix = np.eye(4)
+        if text := attributes.get("transform"):
+            numbers = np.array([self.archive.number(word) for word in text.split()]).reshape(4, 3)
+            matrix[:3, :3] = numbers[:3].T
+            matrix[:3, 3] = numbers[3]
+        return matrix
+
     def _key(self, attributes: Attributes) -> Key:
         """Archive member and identifier that an ``objectid`` refers to (Production extension's path)."""
         part = self.name
@@ -287,16 +303,6 @@ def _kind_of(volume: Attributes) -> str:
     kind = volume.get("volume_type") or volume.get("subtype") or ("modifier" if volume.get("modifier") == "1" else "")
     plain = kind.replace("_", "").strip().lower()
     return "" if plain in ("modelpart", "normalpart") else plain
-
-
-def _transform(attributes: Attributes) -> Array:
-    """(4,4) parent_from_object of a ``transform`` attribute: 12 numbers, rows of a row-vector matrix."""
-    matrix = np.eye(4)
-    if text := attributes.get("transform"):
-        numbers = np.array([float(word) for word in text.split()]).reshape(4, 3)
-        matrix[:3, :3] = numbers[:3].T
-        matrix[:3, 3] = numbers[3]
-    return matrix
 
 
 def _color(text: str) -> Color:

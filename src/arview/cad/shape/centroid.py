@@ -21,8 +21,7 @@ def is_closed(vertices: Array, faces: NDArray[np.int32]) -> bool:
     _, joined = np.unique(np.round((used - used.min(axis=0)) / unit), axis=0, return_inverse=True)
     corners = joined.reshape(-1, 3).astype(np.int64)
     start, end = corners.ravel(), np.roll(corners, -1, axis=1).ravel()
-    count = int(joined.max()) + 1
-    forward = np.where(start < end, 1, -1)
+    count, forward = int(joined.max()) + 1, np.where(start < end, 1, -1)
     keys, inverse = np.unique(np.minimum(start, end) * count + np.maximum(start, end), return_inverse=True)
     balance = np.bincount(inverse.ravel(), weights=forward, minlength=len(keys))
     ends = vertices[np.roll(faces, -1, axis=1)].reshape(-1, 3)

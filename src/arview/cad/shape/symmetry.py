@@ -41,6 +41,11 @@ class Symmetry:
         if self.order is not None and self.order < 2:
             raise InputError(f"symmetry: order {self.order} must be at least 2")
 
+    def enlarged(self, by: float) -> Symmetry:
+        """The same symmetry of the shape enlarged by a factor."""
+        x, y, z = self.through_in_model
+        return Symmetry(self.axis_in_model, (by * x, by * y, by * z), self.order)
+
     def describe(self) -> str:
         """``any angle about +Z`` or ``120° about (0.00, 0.71, 0.71)``."""
         angle = "any angle" if self.order is None else f"{360.0 / self.order:g}°"
@@ -86,8 +91,7 @@ class SurfaceSamples:
     def __init__(self, vertices: Array, faces: NDArray[np.int64], groups: NDArray[np.int64]) -> None:
         from scipy.spatial import cKDTree
 
-        rng = np.random.default_rng(_SEED)
-        areas = face_areas(vertices, faces)
+        rng, areas = np.random.default_rng(_SEED), face_areas(vertices, faces)
         self.vertices, self.faces = vertices, faces
         spread, self.owners = _sample(vertices, faces, areas, _TARGET_COUNT, rng)
         self.owners = np.concatenate([np.arange(len(faces)), self.owners])
@@ -136,8 +140,7 @@ class _SymmetryTest:
         """
         samples, covariance, near_share = self.samples, self.covariance, self.near_share
         reach = self.near_fraction * self.diameter
-        unmatched = np.zeros(len(samples.queries), dtype=bool)
-        is_exact = True
+        unmatched, is_exact = np.zeros(len(samples.queries), dtype=bool), True
         for angle in angles_rad:
             rotation = exp_so3(axis * angle)
             turned = rotation @ covariance @ rotation.T
@@ -191,8 +194,7 @@ def find_symmetries(
     centroid, covariance = surface_moments(vertices, faces)
     used = vertices[np.unique(faces)]
     middle = 0.5 * (used.min(axis=0) + used.max(axis=0))
-    diameter = float(np.linalg.norm(np.ptp(used, axis=0)))
-    centers = [centroid]
+    diameter, centers = float(np.linalg.norm(np.ptp(used, axis=0))), [centroid]
     if np.linalg.norm(middle - centroid) > 0.25 * exact_fraction * diameter:
         centers.append(middle)
     counts = np.bincount(samples.query_groups, minlength=int(groups.max()) + 1)
@@ -251,8 +253,7 @@ def _candidate_axes(vertices: Array, faces: NDArray[np.int64], covariance: Array
     for largest in np.argsort(-weights)[:6]:
         mean = (normals * lengths[:, None])[group.ravel() == largest].sum(axis=0)
         candidates.append(mean / np.linalg.norm(mean))
-    base = _without_duplicates(candidates)
-    bisectors = []
+    base, bisectors = _without_duplicates(candidates), []
     for i, one in enumerate(base):
         for other in base[:i]:
             if abs(float(one @ other)) < 0.9:
@@ -298,8 +299,7 @@ def _closest_on_triangles(points: Array, triangles: Array) -> Array:
     squared = np.maximum((normal * normal).sum(axis=-1, keepdims=True), 1e-300)
     foot = points - normal * (((points - a) * normal).sum(axis=-1, keepdims=True) / squared)
     inside = np.ones(foot.shape[:-1], dtype=bool)
-    best = np.full(foot.shape[:-1], np.inf)
-    closest = np.zeros_like(foot)
+    best, closest = np.full(foot.shape[:-1], np.inf), np.zeros_like(foot)
     for start, end in ((a, b), (b, c), (c, a)):
         edge = end - start
         inside &= (np.cross(edge, foot - start) * normal).sum(axis=-1) >= 0

@@ -154,8 +154,7 @@ class _Document:
             nominal = 0.0 if center is None else center[axis]
             what = "deviation" if center is None else "place"
             more = [("TargetValue", exact(nominal)), ("Direction", _DIRECTION[axis])]
-            name = f"{one.name} {what} {'xyz'[axis]}"
-            item = self._item("LinearCoordinate", one.name, name, self._coordinates, more)
+            item = self._item("LinearCoordinate", one.name, f"{one.name} {what} {'xyz'[axis]}", self._coordinates, more)
             status = _status_without_value(one) if moved is None else "BASIC_OR_TED"
             std = None if covariance is None else max(covariance[3 + axis][3 + axis], 0.0) ** 0.5
             text = None if moved is None else fixed(nominal + moved, decimals)

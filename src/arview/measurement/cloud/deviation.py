@@ -20,9 +20,10 @@ from arview.cad import Component, Model, Part
 from arview.core.fits import orthogonal_complement, row_space
 from arview.errors import InputError
 from arview.geometry import Array, apply, invert, rigid
+from arview.measurement.cloud.enlarged import enlarged, enlargement, reduced
 from arview.measurement.cloud.mesh_surface import MeshSurface
 from arview.measurement.cloud.placing import check_belongs
-from arview.measurement.cloud.points import CloudPoints, prepare_cloud
+from arview.measurement.cloud.points import CloudPoints, prepare_cloud, typical_spacing
 from arview.measurement.cloud.registration import (
     Registration,
     RegistrationOptions,
@@ -81,6 +82,8 @@ class CloudComponent:
         usable_faces: (F,) faces that the photos can see.
         spins: (K,6) motions about the centre, rotations scaled by ``radius_mm``, that leave its shape unchanged.
         joint_mm: as `JOINT_MM`, and of a flat component at most a quarter of its height.
+        spacing_mm: distance between neighbouring points of the cloud.
+        unit: mm in one unit of all these lengths, below 1 for a part that was enlarged.
     """
 
     component: Component
@@ -91,6 +94,13 @@ class CloudComponent:
     usable_faces: NDArray[np.bool_]
     spins: Array
     joint_mm: float
+    spacing_mm: float = 0.0
+    unit: float = 1.0
+
+    @property
+    def reach_mm(self) -> float:
+        """Distance within which a point of the cloud shows a piece of surface."""
+        return max(1.0, 2.0 * GRID_MM, 1.5 * self.spacing_mm)
 
     @property
     def center(self) -> Array:
@@ -123,15 +133,20 @@ def measure_components_in_cloud(
     Raises:
         InputError: the cloud is empty, far from the CAD, of another part, or mirrored.
     """
+    by = enlargement(model)
+    if by > 1.0:
+        cloud, model, part, photos = enlarged(cloud, model, part, photos, by)
     box = model.bounds_in_model + np.array([[-BAND_MM], [BAND_MM]])
     points = prepare_cloud(cloud, box, GRID_MM, MIN_POINTS)
     check_belongs(points, model, BAND_MM)
     views = SurfaceVisibility(model, photos) if photos else None
+    spacing = typical_spacing(points)
     # One thread for BLAS: the matrices are small, and the work is parallel over components.
     with threadpool_limits(1, "blas"), ThreadPoolExecutor(max(1, min(4, os.cpu_count() or 1))) as threads:
         components = list(threads.map(lambda name: cloud_component(name, model, part, views), names or part.inspected))
         if views is None:
             components = _only_scanned(components, points)
+        components = [replace(c, spacing_mm=spacing, unit=1.0 / by) for c in components]
         first = list(threads.map(lambda c: _measure(c, points, None), components))
         places = {m.component: m.measured_from_nominal for m in first if isinstance(m, Move)}
 
@@ -143,9 +158,10 @@ def measure_components_in_cloud(
             return _measure(moved, points, found.nominal_from_measured)
 
         second = list(threads.map(again, range(len(components))))
-        return list(
-            threads.map(lambda i: _with_swapped_name(second[i], components[i], components, points), range(len(second)))
+        named = threads.map(
+            lambda i: _with_swapped_name(second[i], components[i], components, points), range(len(second))
         )
+        return [reduced(one, by) if isinstance(one, Move) else one for one in named]
 
 
 def spin_moves(component: Component, surface: MeshSurface, part: Part | None, min_information: float = 1e-4) -> Array:
@@ -262,22 +278,30 @@ def _measure(c: CloudComponent, cloud: CloudPoints, start: Array | None) -> Move
     if missing is not None:
         return missing
     if len(own) < MIN_POINTS:
-        return NotMeasured(name, "cloud", f"only {len(own)} points of it are in the cloud; {MIN_POINTS} are needed")
+        return NotMeasured(name, "cloud", _too_few(c, len(own)))
     try:
         fit = _register(c, own, start)
     except InputError as error:
         return NotMeasured(name, "cloud", str(error).removeprefix("registration: "))
-    support = _covered(apply(invert(fit.surface_from_points), c.samples), own.points, max(1.0, 2.0 * GRID_MM), fit)
+    support = _covered(apply(invert(fit.surface_from_points), c.samples), own.points, c.reach_mm, fit)
     fitting = float(np.mean(fit.weights > 0.1))
     found = f"{100 * support:.0f} % of its visible surface found, {100 * fitting:.0f} % of the points there fit it"
     if fit.sigma_mm > MAX_NOISE_MM or (support < MIN_SUPPORT and fitting < MIN_FITTING):
         reason = (
             "what stands there does not have its shape: fallen over, bent, another component, or badly reconstructed"
         )
-        return NotMeasured(name, "cloud", f"{reason} ({found}, residuals {fit.sigma_mm:.2f} mm)")
+        return NotMeasured(name, "cloud", f"{reason} ({found}, residuals {fit.sigma_mm * c.unit:.2g} mm)")
     if support < MIN_SUPPORT:
         return NotMeasured(name, "cloud", f"too little of it is where it should be: fallen over, or hidden ({found})")
     return _move(c, fit, support)
+
+
+def _too_few(c: CloudComponent, count: int) -> str:
+    """Why a component has too few points: the cloud is too coarse for it, or does not show it."""
+    if c.surface.areas.sum() < 2.0 * MIN_POINTS * c.spacing_mm**2:
+        apart = f"{c.spacing_mm * c.unit:.2g} mm"
+        return f"the points are too far apart for it, {apart}: {count} of them are on it, {MIN_POINTS} are needed"
+    return f"only {count} points of it are in the cloud; {MIN_POINTS} are needed"
 
 
 def crop_component(c: CloudComponent, cloud: CloudPoints) -> tuple[CloudPoints, CloudPoints]:
@@ -296,7 +320,7 @@ def _missing(c: CloudComponent, near: CloudPoints, own: CloudPoints) -> NotMeasu
         return None
     name = c.component.name
     # The surfaces of others on which it stands are only visible when it is absent.
-    behind = _covered(c.contact, near.points, max(1.0, 2.0 * GRID_MM)) if len(c.contact) else 0.0
+    behind = _covered(c.contact, near.points, c.reach_mm) if len(c.contact) else 0.0
     if behind > 0.4:
         return NotMeasured(
             name,
@@ -387,9 +411,10 @@ def _move(c: CloudComponent, fit: Registration, support: float) -> Move:
         # Minima that differ along what is undetermined only, such as the turn of a round post, are one.
         other = determined @ (twist_about(c.center, invert(fit.runner_up)) * scales) - twist * scales
         if np.linalg.norm(other) > RIVAL_MM:
-            notes.append(f"fits nearly as well {np.linalg.norm(other):.2f} mm away (cost × {fit.runner_up_cost:.2f})")
+            apart_mm = float(np.linalg.norm(other)) * c.unit
+            notes.append(f"fits nearly as well {apart_mm:.2f} mm away (cost × {fit.runner_up_cost:.2f})")
     if np.linalg.norm(twist[3:]) > 0.9 * BAND_MM:
-        notes.append(f"at the limit of the searched band of {BAND_MM:g} mm")
+        notes.append(f"at the limit of the searched band of {BAND_MM * c.unit:.2g} mm")
     if support < 0.6:
         notes.append(f"only {100 * support:.0f} % of its visible surface is in the cloud")
     return Move(
@@ -416,8 +441,7 @@ def _with_swapped_name(
     """Add to a component that did not fit the name of another one whose shape does: the two may be swapped."""
     if isinstance(found, Move) or found.is_missing or "shape" not in found.reason or c.others is None:
         return found
-    foot = c.others.closest(c.center[None]).points[0]
-    tried = [c]
+    foot, tried = c.others.closest(c.center[None]).points[0], [c]
     for other in all_of_them:
         if other.others is None or any(_same_shape(other, done) for done in tried):
             continue

@@ -101,8 +101,7 @@ def find_foreign(
     filled = np.zeros(cell.max(axis=0) + 1, dtype=bool)
     filled[tuple(cell.T)] = True
     of_cell, count = label(filled, np.ones((3, 3, 3)))
-    owner = of_cell[tuple(cell.T)]
-    found = []
+    owner, found = of_cell[tuple(cell.T)], []
     for index in range(1, count + 1):
         mine = far[owner == index]
         area = len(mine) * GRID_MM**2

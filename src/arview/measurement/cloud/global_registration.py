@@ -154,8 +154,7 @@ def _main_axes(normals: Array, max_count: int) -> list[Array]:
 
 def _turns(of_cloud: Array, of_model: Array) -> list[Array]:
     """Rotations (3,3) that turn the cloud's main direction onto one of the model's, either side up, all around it."""
-    turns = []
-    angles = np.arange(0.0, 360.0, STEP_DEG)
+    turns, angles = [], np.arange(0.0, 360.0, STEP_DEG)
     for target in _main_axes(of_model, 2):
         for sign in (1.0, -1.0):
             first = _between(sign * _main_axes(of_cloud, 1)[0], target)

@@ -159,8 +159,7 @@ class MeshSurface:
         _, corner = np.unique(
             same.ravel()[self.faces] * (self.groups.max() + 1) + self.groups[:, None], return_inverse=True
         )
-        corner = corner.reshape(-1, 3)
-        normals = self.face_normals
+        corner, normals = corner.reshape(-1, 3), self.face_normals
         sums, angles = np.zeros((corner.max() + 1, 3)), np.zeros(corner.shape)
         for k in range(3):
             a = self.triangles[:, (k + 1) % 3] - self.triangles[:, k]

@@ -64,10 +64,8 @@ def estimate_noise(points: Array, normals: Array, residuals: Array, rows: Array,
     chosen = _sample(points, count, seed)
     x, n, r, jacobian = points[chosen], normals[chosen], residuals[chosen] / total, rows[chosen]
     rest = np.linalg.qr(jacobian, mode="complete")[0][:, jacobian.shape[1] :]
-    seen = rest.T @ r
-    apart = _apart(x, x)
-    facing = n @ n.T
-    size = float(np.linalg.norm(np.ptp(points, axis=0)))
+    seen, apart = rest.T @ r, _apart(x, x)
+    facing, size = n @ n.T, float(np.linalg.norm(np.ptp(points, axis=0)))
     best, likelihood = NoiseModel(total, 0.0, 0.0, float(len(points))), -np.inf
     for length in np.geomspace(0.02 * size, 0.5 * size, _LENGTHS):
         values, vectors = np.linalg.eigh(rest.T @ (np.exp(-apart / length) * facing) @ rest)

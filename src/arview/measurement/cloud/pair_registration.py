@@ -120,8 +120,7 @@ def find_by_pairs(points: Array, normals: Array | None, model: Model) -> PartPla
     found = candidates(scene, target)
     if not found or found[0].score < MIN_SHARE or found[0].inside > MAX_INSIDE:
         raise InputError("cloud: the part was not found in it: another part, or too little of it")
-    best = found[0]
-    limit_mm = 0.015 * target.diameter_mm
+    best, limit_mm = found[0], 0.015 * target.diameter_mm
     for rival in found[1:]:
         if rival.score * MIN_LEAD < best.score:
             break
@@ -137,8 +136,7 @@ def find_by_pairs(points: Array, normals: Array | None, model: Model) -> PartPla
 
 def candidates(scene: ScenePoints, target: _Target) -> list[PartPlacement]:
     """Different places of the CAD in the cloud, the best first."""
-    rng = np.random.default_rng(SEED)
-    tables = _PairTable(target)
+    rng, tables = np.random.default_rng(SEED), _PairTable(target)
     lists = _near_lists(scene, target.diameter_mm, rng)
     placements: list[PartPlacement] = []
     signs = (1.0, -1.0) if scene.is_oriented else (1.0,)
@@ -170,11 +168,9 @@ def _target(model: Model) -> _Target:
     from scipy.ndimage import distance_transform_edt
 
     vertices, faces, groups = model.mesh
-    surface = MeshSurface(vertices, faces, groups)
-    diameter = model.diameter_mm
+    surface, diameter = MeshSurface(vertices, faces, groups), model.diameter_mm
     samples, of_face = surface.spread(24_000, SEED)
-    normals = surface.face_normals[of_face]
-    cell = diameter / FIELD_CELLS
+    normals, cell = surface.face_normals[of_face], diameter / FIELD_CELLS
     margin = int(np.ceil(1.6 * COARSE_REACH * FIELD_CELLS)) + 1
     low = samples.min(axis=0) - margin * cell
     index = np.round((samples - low) / cell).astype(np.int64)
@@ -266,8 +262,7 @@ class _PairTable:
 
 def _scene_pairs(scene: ScenePoints, target: _Target, count: int, rng: np.random.Generator) -> NDArray[np.int64]:
     """(K,2) pairs of scene points within the range, with normals that are not parallel, rare ones preferred."""
-    share = scene.weights / scene.weights.sum()
-    tree = cKDTree(scene.points)
+    share, tree = scene.weights / scene.weights.sum(), cKDTree(scene.points)
     firsts = rng.choice(len(scene.points), size=min(count // 12 + 1, 3 * len(scene.points)), p=share)
     found = []
     for first in firsts:

@@ -142,8 +142,7 @@ def check_belongs(points: CloudPoints, model: Model, band_mm: float) -> None:
     """Raise InputError when few points are near the CAD, or many more when the cloud is mirrored."""
     vertices, faces, _ = model.mesh
     surface = MeshSurface(vertices, faces)
-    few = points.points[:: max(1, len(points) // 6000)]
-    near = 0.2 * band_mm
+    few, near = points.points[:: max(1, len(points) // 6000)], 0.2 * band_mm
 
     def share(trial: Array) -> float:
         distance = surface.closest(trial, near).faces

@@ -68,6 +68,14 @@ def prepare_cloud(cloud: DenseCloud, box: Array, grid_mm: float, min_points: int
     return grid_average(filled, grid_mm)
 
 
+def typical_spacing(cloud: CloudPoints) -> float:
+    """Distance between neighbouring points: of points that lie at random, the side of the square that each has."""
+    from scipy.spatial import cKDTree
+
+    few = cloud.points[:: max(1, len(cloud) // 5000)]
+    return float(2.0 * np.median(cKDTree(cloud.points).query(few, k=2)[0][:, 1]))
+
+
 def join(parts: list[CloudPoints]) -> CloudPoints:
     """All points in one."""
     return CloudPoints(
@@ -86,8 +94,7 @@ def grid_average(cloud: CloudPoints, grid_mm: float) -> CloudPoints:
         return cloud
     cell = np.floor(cloud.points / grid_mm).astype(np.int64)
     cell -= cell.min(axis=0)
-    size = cell.max(axis=0) + 1
-    main = np.argmax(np.abs(cloud.normals), axis=1)
+    size, main = cell.max(axis=0) + 1, np.argmax(np.abs(cloud.normals), axis=1)
     side = 2 * main + (np.take_along_axis(cloud.normals, main[:, None], axis=1)[:, 0] < 0)
     key = ((cell[:, 0] * size[1] + cell[:, 1]) * size[2] + cell[:, 2]) * 6 + side
     order = np.argsort(key, kind="stable")

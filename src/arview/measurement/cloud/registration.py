@@ -194,8 +194,7 @@ def register_to_surface(
         system = problem.linearised(pose, width, hint)
         step = -(system.vectors / system.values) @ (system.vectors.T @ (basis @ system.gradient))
         twist = (basis.T @ step) * _scales(radius)
-        pose = move_about(center, twist) @ pose
-        hint = system.faces
+        pose, hint = move_about(center, twist) @ pose, system.faces
         turned_deg = float(np.rad2deg(np.linalg.norm(twist[:3])))
         is_narrow = width <= max(system.sigma, o.min_width_mm, o.last_distance_mm / DISTANCE_SIGMAS)
         if is_narrow and np.linalg.norm(twist[3:]) < o.threshold_mm and turned_deg < o.threshold_deg:
@@ -303,8 +302,7 @@ class _Problem:
 
     def linearised(self, pose: Array, width: float, hint: NDArray[np.int64] | None) -> _LinearSystem:
         """Residuals, weights and normal equations at a pose (4,4) for a kernel of some width in mm."""
-        o = self.options
-        moved = apply(pose, self.points)
+        o, moved = self.options, apply(pose, self.points)
         reach = min(max(DISTANCE_SIGMAS * width, o.last_distance_mm), o.first_distance_mm)
         closest = self.surface.closest(moved, reach, hint)
         residuals = closest.distances
@@ -343,8 +341,7 @@ class _Problem:
 
     def result(self, system: _LinearSystem, pose: Array, iterations: int, converged: bool) -> Registration:
         """The registration with its covariance."""
-        determined = system.vectors.T @ self.basis
-        scales = _scales(self.radius)
+        determined, scales = system.vectors.T @ self.basis, _scales(self.radius)
         used = np.flatnonzero(system.weights > 0.1 * self.base)
         residuals, weights = system.residuals[used], system.weights[used]
         own = np.sqrt(self.base[used])  # residuals × own have equal variance

@@ -6,7 +6,7 @@ displacements of components then grow with their distance from the datums, and l
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from arview.cad import Model
 from arview.core.fits import TUKEY_SIGMAS, robust_sigma, tukey_weights
 from arview.errors import InputError
 from arview.geometry import Array, exp_so3, rigid
+from arview.measurement.cloud.enlarged import enlargement
 from arview.measurement.cloud.mesh_surface import MeshSurface
 from arview.measurement.cloud.points import prepare_cloud
 from arview.reconstruction import DenseCloud, Similarity
@@ -67,13 +68,14 @@ def cloud_scale(cloud: DenseCloud, model: Model, names: tuple[str, ...]) -> Clou
     """
     parts = [model.component(name) for name in names]
     offsets = np.cumsum([0, *(len(part.vertices_in_model) for part in parts)])
-    vertices = np.concatenate([part.vertices_in_model for part in parts])
+    by = enlargement(model)
+    vertices = by * np.concatenate([part.vertices_in_model for part in parts])
     surface = MeshSurface(
         vertices, np.concatenate([p.faces + start for p, start in zip(parts, offsets[:-1], strict=True)])
     )
     box = np.stack([vertices.min(axis=0) - REACH_MM, vertices.max(axis=0) + REACH_MM])
     try:
-        points = prepare_cloud(cloud, box, GRID_MM, 500).points
+        points = prepare_cloud(replace(cloud, points=cloud.points * by), box, GRID_MM, 500).points
     except InputError:
         return None
     if len(points) > MAX_POINTS:
@@ -82,7 +84,7 @@ def cloud_scale(cloud: DenseCloud, model: Model, names: tuple[str, ...]) -> Clou
     fit = fit_similarity_to_surface(points, surface, size, REACH_MM, NOISE_MM, min_points=200)
     if fit is None or fit.scale_std is None:
         return None
-    factor, std = 1.0 / fit.similarity.scale, float(np.hypot(fit.scale_std, FORM_MM / size))
+    factor, std = 1.0 / fit.similarity.scale, float(np.hypot(fit.scale_std, by * FORM_MM / size))
     excess = abs(factor - 1.0)
     return CloudScale(factor, std, excess > max(SIGNIFICANT * std, MIN_EXCESS))
 

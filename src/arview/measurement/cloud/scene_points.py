@@ -91,19 +91,16 @@ def scene_points(points: Array, normals: Array | None, diameter_mm: float) -> Sc
             "cloud: its points lie on no surface, so the part is not in it; is it the right file, and are its columns "
             "x, y, z?"
         )
-    estimated = _normals(points)
-    is_oriented = False
+    estimated, is_oriented = _normals(points), False
     if own is not None:
         sign = np.sign(np.sum(estimated * own, axis=1))
         is_oriented = _is_consistent(points, own)
         estimated = estimated * np.where(sign == 0.0, 1.0, sign)[:, None] if is_oriented else estimated
-    before = len(points)
-    on_table = wide_planes(points, estimated, diameter_mm)
+    before, on_table = len(points), wide_planes(points, estimated, diameter_mm)
     points, estimated = points[~on_table], estimated[~on_table]
     if len(points) < MIN_POINTS:
         raise InputError("cloud: the part was not found in it: the cloud is flat")
-    fine = _thin(points, FINE * diameter_mm)
-    cell = COARSE * diameter_mm
+    fine, cell = _thin(points, FINE * diameter_mm), COARSE * diameter_mm
     coarse = _thin(points, cell)
     while len(coarse) > MAX_COARSE:
         cell *= 1.15
@@ -126,8 +123,7 @@ def wide_planes(points: Array, normals: Array, diameter_mm: float) -> Flags:
 
     Planes are found by Open3D's RANSAC, on few points.
     """
-    o3d = load_open3d()
-    out = np.zeros(len(points), dtype=bool)
+    o3d, out = load_open3d(), np.zeros(len(points), dtype=bool)
     few = _thin(points, 2.0 * COARSE * diameter_mm)
     tolerance = max(PLANE_TOLERANCE * diameter_mm, 1e-6)
     o3d.utility.random.seed(SEED)
@@ -137,8 +133,7 @@ def wide_planes(points: Array, normals: Array, diameter_mm: float) -> Flags:
             break
         cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points[rest]))
         plane, inliers = cloud.segment_plane(tolerance, 3, 600)
-        normal = np.asarray(plane[:3])
-        flat = points[rest[inliers]]
+        normal, flat = np.asarray(plane[:3]), points[rest[inliers]]
         if len(flat) < 0.08 * len(rest):
             break
         axes = np.linalg.svd(flat - flat.mean(axis=0), full_matrices=False)[2]
@@ -156,10 +151,8 @@ def plane_weights(points: Array, normals: Array, tolerance: float, share: float 
 
     Points are on one plane if their normals agree within 8° and they are within ``tolerance`` of it.
     """
-    weights = np.ones(len(points))
-    left = np.arange(len(points))
-    rng = np.random.default_rng(0)
-    limit = share * len(points)
+    weights, left = np.ones(len(points)), np.arange(len(points))
+    rng, limit = np.random.default_rng(0), share * len(points)
     for _ in range(60):
         if len(left) < limit:
             break

@@ -152,8 +152,7 @@ def align(
         change = columns @ solver  # (7,N) of the move by this datum's offsets; the last column is of the prior scale
         own = change[:, : len(rows)]
         before, before_gain, rest = move, gain, one.offsets_mm - rows @ move
-        move = move + own @ rest
-        gain = gain - (own @ rows) @ gain
+        move, gain = move + own @ rest, gain - (own @ rows) @ gain
         gain[:, here] += own
         if with_scale:
             move = move - change[:, -1] * before[6]
@@ -228,8 +227,7 @@ def _result(
 
 def _solver(design: Array, one: DatumEquations, fit: DatumFit, scale_std: float | None) -> Array:
     """(K,N) matrix that maps offsets to the least-squares directions; (K,N+1) with the prior scale as last value."""
-    columns = design.shape[1]
-    weights = fit.weights / fit.weights.max()
+    columns, weights = design.shape[1], fit.weights / fit.weights.max()
     if one.by_radius is not None:
         design = np.concatenate([design, one.by_radius[:, None]], axis=1)
     if scale_std is not None:

@@ -64,8 +64,7 @@ def fit_datum(one: DatumEquations, is_exact: bool) -> DatumFit:
         correlation_factor(one.points[inliers], noise[inliers]),
         block_factor(one.points[inliers], noise[inliers], rank),
     )
-    weights = share / one.variances
-    radius = None
+    weights, radius = share / one.variances, None
     if one.by_radius is not None:
         weighted = local * weights[:, None]
         normal = np.linalg.pinv(weighted.T @ local, rcond=1e-12, hermitian=True)
@@ -88,10 +87,8 @@ def robust_weights(design: Array, values: Array, variances: Array) -> tuple[Arra
     Returns:
         weights (N,) in 0–1, and residuals (N,).
     """
-    root = 1.0 / np.sqrt(variances)
-    share = np.ones(len(values))
-    residuals = values
-    unit = np.maximum(np.sqrt(np.mean(design**2, axis=0)), 1e-12)
+    root, share = 1.0 / np.sqrt(variances), np.ones(len(values))
+    residuals, unit = values, np.maximum(np.sqrt(np.mean(design**2, axis=0)), 1e-12)
     design = design / unit
     for step in range(40):
         weighted = design * (share * root**2)[:, None]
@@ -130,8 +127,7 @@ def correlation_factor(points: Array, residuals: Array, max_points: int = 600) -
     pairs = np.triu_indices(len(points), 1)
     distance, product = distance[pairs], product[pairs]
     edges = np.linspace(0.0, 0.5 * float(distance.max()) + 1e-9, 13)
-    bins = np.digitize(distance, edges) - 1
-    factor = 1.0
+    bins, factor = np.digitize(distance, edges) - 1, 1.0
     for index in range(len(edges) - 1):
         of_bin = product[bins == index]
         if len(of_bin) < 10:

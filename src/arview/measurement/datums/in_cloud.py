@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from arview.cad import Datum, Model
 from arview.geometry import Array
+from arview.measurement.cloud.enlarged import enlargement
 from arview.measurement.cloud.mesh_surface import MeshSurface
 from arview.measurement.cloud.points import CloudPoints, prepare_cloud
 from arview.measurement.datums.cad_features import edge_line, flat_faces, round_faces
@@ -58,7 +59,8 @@ def measure_datums_in_cloud(
     """
     if not datums:
         return []
-    points = prepare_cloud(cloud, model.bounds_in_model + np.array([[-5.0], [5.0]]), _GRID_MM, _MIN_CLOUD_POINTS)
+    grid_mm = _GRID_MM / enlargement(model)
+    points = prepare_cloud(cloud, model.bounds_in_model + np.array([[-5.0], [5.0]]), grid_mm, _MIN_CLOUD_POINTS)
     return [_measure(datum, model, points, moves) for datum in datums]
 
 
@@ -75,7 +77,8 @@ def _measure(datum: Datum, model: Model, cloud: CloudPoints, moves: Mapping[str,
     faces, side = round_faces(component, datum) if is_round else (flat_faces(component, datum), 0.0)
     near, offsets, normals = _offsets(datum, model, cloud, faces)
     if datum.feature == "point":
-        around = np.linalg.norm(near.points - np.array(datum.point_in_model), axis=1) < POINT_RADIUS_MM
+        apart = np.linalg.norm(near.points - np.array(datum.point_in_model), axis=1)
+        around = apart < POINT_RADIUS_MM / enlargement(model)
         near, offsets, normals = near.only(around), offsets[around], normals[around]
     _check(datum, len(offsets))
     if datum.feature in ("hole", "pin"):  # a short bore does not determine the tilt of its axis
@@ -109,16 +112,17 @@ def _offsets(
     """Points near some faces of the datum's component, their signed distances, and the faces' normals there."""
     component = model.component(datum.component)
     surface = MeshSurface(component.vertices_in_model, component.faces)
-    low, high = component.bounds_in_model[0] - REACH_MM, component.bounds_in_model[1] + REACH_MM
+    small = 1.0 / enlargement(model)
+    reach_mm = small * REACH_MM
+    low, high = component.bounds_in_model[0] - reach_mm, component.bounds_in_model[1] + reach_mm
     near = cloud.only(np.all((cloud.points > low) & (cloud.points < high), axis=1))
-    closest = surface.closest(near.points, REACH_MM)
+    closest = surface.closest(near.points, reach_mm)
     mine = (closest.faces >= 0) & ~closest.is_edge
     mine[mine] &= faces[closest.faces[mine]]
     facing = np.sum(near.normals * np.nan_to_num(closest.normals), axis=1)
     mine &= (facing > 0.5) | ~near.normals.any(axis=1)
-    chosen = np.flatnonzero(mine)
-    index = model.index(datum.component)
-    for clear_mm in (CLEAR_MM, MIN_CLEAR_MM):
+    chosen, index = np.flatnonzero(mine), model.index(datum.component)
+    for clear_mm in (small * CLEAR_MM, small * MIN_CLEAR_MM):
         clear = chosen[~near_others(near.points[chosen], model, index, clear_mm)] if len(chosen) else chosen
         if len(clear) >= min(300, 0.3 * len(chosen)):
             break
@@ -138,7 +142,8 @@ def _measure_edge(datum: Datum, model: Model, cloud: CloudPoints) -> DatumEquati
         near, offsets, _ = _offsets(datum, model, cloud, flat_faces(model.component(datum.component), face))
         from_line = near.points - line.start
         across = from_line @ np.cross(normal, line.direction)
-        band = (np.abs(across) > _EDGE_BAND_MM[0]) & (np.abs(across) < _EDGE_BAND_MM[1])
+        from_edge = np.abs(across) * enlargement(model)
+        band = (from_edge > _EDGE_BAND_MM[0]) & (from_edge < _EDGE_BAND_MM[1])
         _check(datum, int(np.count_nonzero(band)))
         along, across = (from_line @ line.direction)[band], across[band]
         design = np.stack([np.ones_like(along), along, across], axis=1)

@@ -251,8 +251,7 @@ def _rim_views(views: PhotoViews, rim: Rim, points: Array, radial: Array) -> NDA
 
 def _seen_through(rim: Rim, other: Array, eye: Array) -> NDArray[np.bool_]:
     """(N,) which points of the other rim are seen from a point (3,): for a hole through it, for a pin beside it."""
-    toward = eye - other
-    height = (rim.center - other) @ rim.axis
+    toward, height = eye - other, (rim.center - other) @ rim.axis
     at_rim = other + toward * (height / (toward @ rim.axis))[:, None] - rim.center
     off = np.linalg.norm(at_rim - (at_rim @ rim.axis)[:, None] * rim.axis, axis=1)
     is_inside = off < rim.radius_mm

@@ -138,8 +138,7 @@ def _by_own_edges(datum: Datum, edges: EdgePoints, views: PhotoViews) -> Move:
         if found is None:
             raise DatumNotMeasuredError(f"{name}: its edges are not seen where they should be")
         fit, dark = found
-        turn = exp_so3(fit.twist[:3])
-        middle = place[:3, :3] @ center + place[:3, 3]
+        turn, middle = exp_so3(fit.twist[:3]), place[:3, :3] @ center + place[:3, 3]
         place = rigid(turn, middle - turn @ middle + fit.twist[3:]) @ place
     assert fit is not None
     unit = np.array([radius_mm] * 3 + [1.0] * 3)

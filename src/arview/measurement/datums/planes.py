@@ -47,8 +47,7 @@ def plane_samples(component: Component, datum: Datum, count: int, radius_mm: flo
     normal, point = np.array(datum.direction_in_model), np.array(datum.point_in_model)
     corners = component.vertices_in_model[component.faces]
     doubled = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    areas = np.linalg.norm(doubled, axis=1)
-    heights = (corners - point) @ normal
+    areas, heights = np.linalg.norm(doubled, axis=1), (corners - point) @ normal
     flat = (doubled @ normal > 0.999 * areas) & (np.abs(heights).max(axis=1) < 0.05) & (areas > 1e-9)
     if not flat.any():
         return np.zeros((0, 3))

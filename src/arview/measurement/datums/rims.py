@@ -56,8 +56,7 @@ def find_rim(model: Model, datum: Datum, toward: Array) -> Rim:
     across = vertices - heights[:, None] * axis
     radii = np.linalg.norm(across, axis=1)
     low, high = (0.47, 1.0) if datum.feature == "hole" else (0.25, 0.53)
-    near = (radii > low * diameter) & (radii < high * diameter)
-    circles = []
+    near, circles = (radii > low * diameter) & (radii < high * diameter), []
     keys = np.round(np.stack([heights[near] / 0.02, radii[near] / 0.02], axis=1))
     for key in np.unique(keys, axis=0):
         of = np.flatnonzero(near)[(np.abs(keys - key) <= 1).all(axis=1)]

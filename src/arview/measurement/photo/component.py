@@ -60,8 +60,7 @@ class MeasuredComponent:
 
     def moved(self, place: Array, twist: Array) -> Array:
         """The place after a further twist (6,) about the point to which the place takes the centre."""
-        rotation = exp_so3(twist[:3])
-        center = apply(place, self.center)
+        rotation, center = exp_so3(twist[:3]), apply(place, self.center)
         return rigid(rotation, center - rotation @ center + twist[3:]) @ place
 
     def size_mm(self, twist: Array) -> float:

@@ -219,8 +219,12 @@ class ComponentEdges:
         flanked = self._choose_clear(place)
         edges = self.predicted(place, self._clear[0])
         if len(edges.points) < MIN_POINTS or len(np.unique(edges.view)) < 3:
-            reason = "fewer than 3 photos show enough of its edges; take more photos of it"
-            return NotMeasured(self.body.shape.name, "edges", reason, is_unseen=True)
+            return NotMeasured(
+                self.body.shape.name,
+                "edges",
+                "fewer than 3 photos show enough of its edges; take more photos of it",
+                is_unseen=True,
+            )
         # Start on reduced pictures where a pixel is much smaller than the displacements searched for.
         levels = [k for k in (2, 1) if self.body.px_mm * 2.0**k < 0.6]
         rounds = [(k, 6.0) for k in levels] + [(0, reach) for reach in REACHES_PX]
@@ -238,8 +242,12 @@ class ComponentEdges:
             if is_fine:
                 ok &= np.abs(found.offsets_mm) < 0.5 * rivals * found.mm_per_px
             if np.count_nonzero(ok) < MIN_POINTS:
-                reason = f"only {np.count_nonzero(ok)} of {len(ok)} points of its edges are seen in the photos"
-                return NotMeasured(self.body.shape.name, "edges", reason, support=self._support(edges, place))
+                return NotMeasured(
+                    self.body.shape.name,
+                    "edges",
+                    f"only {np.count_nonzero(ok)} of {len(ok)} points of its edges are seen in the photos",
+                    support=self._support(edges, place),
+                )
             before, dark_before_mm = place, dark_mm
             fit, dark_mm = self._fit(edges, found, ok, place, dark_mm, is_last=False)
             place = self.body.moved(place, fit.twist)
@@ -254,8 +262,12 @@ class ComponentEdges:
         small = float(np.interp(size_px, SMALL_SIZES_PX, (1.0, 0.0)))
         min_support = MIN_SUPPORT + SMALL_SUPPORT * small
         if support < min_support or used < MIN_POINTS or len(fit.undetermined) == 6:
-            reason = f"its edges are not seen where they should be: {100 * support:.0f} % more than by chance"
-            return NotMeasured(self.body.shape.name, "edges", reason, support=support)
+            return NotMeasured(
+                self.body.shape.name,
+                "edges",
+                f"its edges are not seen where they should be: {100 * support:.0f} % more than by chance",
+                support=support,
+            )
         by_poses = pose_gain(self.views, fit, edges.view[ok], found.pose_rows[ok])
         small = 1.0 if self.body.uses_joints else small
         weak = max(WEAK_SUPPORT - support, 0.0)
@@ -296,8 +308,7 @@ class ComponentEdges:
     def _clear_of(self, place: Array, clear_px: float) -> tuple[EdgePoints, Array]:
         """The points of `predicted`, and (N,2) the offset of the nearest edge beside each, px; inf if far."""
         edges, gaps_px = self._all_predicted(place)
-        kept = np.flatnonzero(np.hypot(*gaps_px.T) >= clear_px)
-        count = MAX_POINTS
+        kept, count = np.flatnonzero(np.hypot(*gaps_px.T) >= clear_px), MAX_POINTS
         kept = kept[:: int(np.ceil(len(kept) / count))] if len(kept) > count else kept
         return edges.of(kept), gaps_px[kept]
 

@@ -102,8 +102,7 @@ def fit_rigid(
     values, vectors = np.linalg.eigh(basis.T @ covariance @ basis)
     is_open = np.concatenate([(basis @ vectors[:, values > undetermined_mm**2]).T, modes[:, shares < min_support].T])
     held = basis @ orthogonal_complement(is_open @ basis).T
-    project = held @ held.T
-    inliers_mm = residuals[is_in] * sigmas[is_in]
+    project, inliers_mm = held @ held.T, residuals[is_in] * sigmas[is_in]
     return RigidFit(
         twist=project @ solution * scale,
         covariance=project @ covariance @ project * np.outer(scale, scale),

@@ -95,11 +95,16 @@ def _absent_if_no_edges(found: MethodResults, results: Mapping[str, MethodResult
     clear = sum(isinstance(one, Move) and one.support > CLEAR_SUPPORT for one in others)
     if clear < MIN_CLEAR:
         return found
-    reason = (
-        "missing, or far from its place: none of its edges is seen where it should be"
-        f" ({100 * edges.support:.0f} % more than by chance), while those of {clear} others are"
-    )
-    return {method: NotMeasured(edges.component, method, reason, is_missing=True) for method in found}
+    return {
+        method: NotMeasured(
+            edges.component,
+            method,
+            "missing, or far from its place: none of its edges is seen where it should be"
+            f" ({100 * edges.support:.0f} % more than by chance), while those of {clear} others are",
+            is_missing=True,
+        )
+        for method in found
+    }
 
 
 def measure_component(views: PhotoViews, index: int, part: Part | None) -> MethodResults:
@@ -130,8 +135,11 @@ def _uncontradicted(sweep: Move | NotMeasured, edges: Move | NotMeasured) -> Mov
     apart_mm = [pair.difference_mm for pair in agreements([sweep, edges]) if pair.is_contradiction]
     if not apart_mm:
         return sweep
-    reason = f"contradicts its edges, {100 * edges.support:.0f} % of which are seen: {apart_mm[0]:.2f} mm apart"
-    return NotMeasured(sweep.component, "sweep", reason)
+    return NotMeasured(
+        sweep.component,
+        "sweep",
+        f"contradicts its edges, {100 * edges.support:.0f} % of which are seen: {apart_mm[0]:.2f} mm apart",
+    )
 
 
 def _by_edges(body: MeasuredComponent) -> Move | NotMeasured:

@@ -110,8 +110,7 @@ def free_directions(component: Component, part: Part | None, center: Array, radi
 
     These follow from continuous symmetries, found in the mesh or declared in the part file.
     """
-    symmetries = symmetries_of(component, part)
-    moves = []
+    symmetries, moves = symmetries_of(component, part), []
     for symmetry in symmetries:
         if symmetry.order is None:
             axis = np.array(symmetry.axis_in_model)

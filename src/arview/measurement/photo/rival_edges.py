@@ -78,8 +78,7 @@ def _note(
     apart = pixels[second] - pixels[first]
     normal = np.stack([-along[first, 1], along[first, 0]], axis=1)
     signed = np.sum(normal * apart, axis=1)
-    across = np.abs(signed)
-    onward = np.abs(np.sum(along[first] * apart, axis=1))
+    across, onward = np.abs(signed), np.abs(np.sum(along[first] * apart, axis=1))
     parallel = np.abs(np.sum(along[first] * along[second], axis=1)) > 0.8
     beside = parallel & (onward < 2.5) & (across > same_px) & (across < reach_px)
     beside &= across < np.hypot(*result[of[first]].T)

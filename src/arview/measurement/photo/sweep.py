@@ -259,8 +259,7 @@ def _peaks(
     pixel variance that its minimum shows, give the variance of the position.
     """
     n, pitch = len(scores), steps[1] - steps[0]
-    best = np.clip(np.argmax(scores, axis=1), 1, len(steps) - 2)
-    rows = np.arange(n)
+    best, rows = np.clip(np.argmax(scores, axis=1), 1, len(steps) - 2), np.arange(n)
     a, b, c = (scores[rows, best + k].astype(np.float64) for k in (-1, 0, 1))
     bend = a - 2.0 * b + c
     is_peak = (b >= a) & (b >= c) & (bend < 0) & (a > -1.0) & (c > -1.0)
@@ -276,8 +275,7 @@ def _peaks(
 
 def pose_rows(views: PhotoViews, samples: Samples, chosen: Indices) -> Array:
     """(N,6M) derivative of a sample's offset by the twists of the poses: that of a point triangulated in its views."""
-    count = len(views.cameras)
-    moment = np.zeros((len(samples.points), 3, 3))
+    count, moment = len(views.cameras), np.zeros((len(samples.points), 3, 3))
     parts = []
     for view in range(count):
         of = np.flatnonzero((chosen == view).any(axis=1))
@@ -327,11 +325,14 @@ class ComponentSweep:
         chosen = self._pick(np.eye(4))
         seen = np.count_nonzero(chosen >= 0, axis=1) >= MIN_VIEWS
         if np.count_nonzero(seen) < MIN_SAMPLES:
-            reason = f"fewer than {MIN_VIEWS} photos show it well enough; take more photos of it"
-            return NotMeasured(self.body.shape.name, "sweep", reason, is_unseen=True)
+            return NotMeasured(
+                self.body.shape.name,
+                "sweep",
+                f"fewer than {MIN_VIEWS} photos show it well enough; take more photos of it",
+                is_unseen=True,
+            )
         patches, is_on = self._cut(PATCH_POINTS, PATCH_PX / PATCH_POINTS * self.body.px_mm)
-        shades = shades_of(is_on)
-        places = [self._coarse(chosen, seen), *starts]
+        shades, places = shades_of(is_on), [self._coarse(chosen, seen), *starts]
         place = max(places, key=lambda p: self._similarity(p, patches, is_on, shades)) if starts else places[0]
         fit: RigidFit | None = None
         range_px = FINE_RANGE_PX

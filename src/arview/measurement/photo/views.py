@@ -112,8 +112,7 @@ class PhotoViews:
         camera, pose = self.cameras[view], self.cam_from_model[view]
         vertices, faces, owner = self.model.mesh
         if component is not None and component >= 0:
-            mine = np.unique(faces[owner == component])
-            vertices = vertices.copy()
+            mine, vertices = np.unique(faces[owner == component]), vertices.copy()
             vertices[mine] = apply(place, vertices[mine])
         elif component is not None:
             faces, owner = faces[owner != -1 - component], owner[owner != -1 - component]

@@ -239,8 +239,7 @@ def length_of(vector: Array, covariance: Array, deviations: Array | None, axes: 
         deviations: (D,3) Monte Carlo draws of the error, or None.
         axes: number of determined axes.
     """
-    value = float(np.linalg.norm(vector))
-    direction = _direction(vector, covariance)
+    value, direction = float(np.linalg.norm(vector)), _direction(vector, covariance)
     along = _along(covariance, direction)
     sigma = float(np.sqrt(max(0.0, np.trace(covariance)) / axes))
     corrected = rice_estimate(value, sigma, axes) if sigma > 0 else value

@@ -105,11 +105,9 @@ def combine(moves: Sequence[Move]) -> CombinedMove:
         raise InputError("combine: expected at least one move, and all of one component")
     radius = moves[0].radius_mm
     unit = np.array([radius] * 3 + [1.0] * 3)
-    scaled = np.outer(unit, unit)
-    twists = [move.twist * unit for move in moves]
+    scaled, twists = np.outer(unit, unit), [move.twist * unit for move in moves]
     bases = [orthogonal_complement(move.undetermined) for move in moves]
-    noise = [move.covariance * scaled for move in moves]
-    weights = []
+    noise, weights = [move.covariance * scaled for move in moves], []
     for covariance, basis in zip(noise, bases, strict=True):
         inside = basis @ covariance @ basis.T
         weights.append(basis.T @ np.linalg.pinv(inside, rcond=1e-12, hermitian=True) @ basis)

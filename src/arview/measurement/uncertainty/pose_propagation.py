@@ -38,8 +38,7 @@ def shifts_from_poses(
     count, size = len(photos), 9 if has_lenses else 6
     total, parts = np.zeros((len(points), 3, 3)), np.zeros((len(points), 3, size * count))
     for view, photo in enumerate(photos):
-        rotation = photo.cam_from_scan[:3, :3]
-        in_cam = apply(photo.cam_from_scan, points)
+        rotation, in_cam = photo.cam_from_scan[:3, :3], apply(photo.cam_from_scan, points)
         square = np.sum(in_cam**2, axis=1)
         ray = in_cam @ rotation / np.sqrt(square)[:, None]
         across = (np.eye(3) - ray[:, :, None] * ray[:, None, :]) * (sees[:, view] / square)[:, None, None]

@@ -200,8 +200,7 @@ def _read_las(path: Path) -> RawPoints:
 def _read_e57(path: Path) -> RawPoints:
     """All scans of an E57 file by pye57, in their common frame."""
     with _library("pye57", path=path, kind="E57") as (pye57,):
-        collector = PointCollector(path)
-        file = pye57.E57(str(path))
+        collector, file = PointCollector(path), pye57.E57(str(path))
         try:
             count = sum(int(file.get_header(index).point_count) for index in range(file.scan_count))
             check_count(path, count)
