@@ -4,7 +4,8 @@
 |---|---|
 | ``job.json`` | part, serial, camera; of a re-check also its first measurement and the components |
 | ``photos/`` | the photos as they were received |
-| ``photos.jsonl`` | a line for each photo, for the end of the walk, and for its reopening; append-only |
+| ``photos.jsonl`` | a line for each photo, for one taken back, for the end of the walk and its reopening; append-only |
+| ``taken_back/`` | photos that were taken back, which count no more |
 | ``state.json`` | `WalkState`, written by the worker |
 | ``rough/inspection.json`` | provisional numbers of the first photos |
 | ``recheck/NN/`` | jobs of single components measured again |
@@ -198,8 +199,27 @@ class JobFolder:
             self._append(vars(photo), log)
         return name
 
+    def take_back(self, name: str, why: str = "unwanted") -> None:
+        """Take a photo back: it is moved to ``taken_back/`` and counts no more.
+
+        Args:
+            name: of the photo.
+            why: a word for the log, such as ``blurred``.
+
+        Raises:
+            InputError: there is no such photo, or the walk has ended.
+            OutputError: the folder cannot be written to.
+        """
+        with self._exclusive():
+            log = _read_log(self.path / "photos.jsonl")
+            if log.is_ended or name not in {photo.name for photo in log.photos}:
+                raise InputError(f"job {self.id}: {name} is no photo that can be taken back; reopen a walk that ended")
+            self._append({"taken_back": name, "why": why, "time": utc_now()}, log)
+            (self.path / "taken_back").mkdir(exist_ok=True)
+            (self.path / "photos" / name).replace(self.path / "taken_back" / name)
+
     def photos(self) -> tuple[StoredPhoto, ...]:
-        """All photos that were confirmed, in the order in which they came."""
+        """All photos that were confirmed and not taken back, in the order in which they came."""
         return _read_log(self.path / "photos.jsonl").photos
 
     def remove_unconfirmed(self) -> None:
@@ -401,6 +421,9 @@ def _read_log(path: Path) -> _Log:
         document = parse_line(line)
         if isinstance(document, dict) and ("end" in document or "reopened" in document):
             ended = _time_of(document["end"]) if "end" in document else None
+            continue
+        if isinstance(document, dict) and "taken_back" in document:
+            photos = [photo for photo in photos if photo.name != document["taken_back"]]
             continue
         try:
             photos.append(photo_of_line(document))

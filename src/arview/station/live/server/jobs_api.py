@@ -86,6 +86,7 @@ class JobHandlers:
             Route(f"{job}/inspection.json", self.inspection),
             Route(f"{job}/decisions.csv", self.decisions),
             Route(f"{job}/photos/{{name:path}}", self.photo),
+            Route(f"{job}/photos/{{name}}", self.take_back, methods=["DELETE"]),
             Route(f"{job}/rework/{{component}}.svg", self.drawing),
             Route(f"{job}/rework/{{picture:path}}", self.picture),
         ]
@@ -135,8 +136,7 @@ class JobHandlers:
     async def reopen(self, request: Request) -> Response:
         """More photos come after all."""
         job = await self._job(request)
-        await self._stored(lambda: job.reopen())
-        await asyncio.to_thread(self._desk.changed, job)
+        await self._stored(lambda: self._desk.reopen(job))
         return await self._document(job)
 
     async def recheck(self, request: Request) -> Response:
@@ -223,6 +223,15 @@ class JobHandlers:
             return photo
 
         return JSONResponse({"photo": await asyncio.to_thread(store)}, 201)
+
+    async def take_back(self, request: Request) -> Response:
+        """Take a photo back, until the walk has ended."""
+        job = await self._job(request)
+        why = request.query_params.get("why", "unwanted")[:40]
+        await self._stored(lambda: job.take_back(request.path_params["name"], why))
+        await asyncio.to_thread(self._desk.lost, job)
+        await asyncio.to_thread(self._desk.changed, job)
+        return await self._document(job)
 
     async def photo(self, request: Request) -> Response:
         """A photo as it was received."""
