@@ -38,11 +38,11 @@ def rework_context(evidence: ReportEvidence) -> dict[str, Any]:
             {
                 "name": one.component,
                 "how": _HOW.get(one.how, one.how),
-                "what": f"{one.what[:1].upper()}{one.what[1:]}.",
+                "what": "" if any(one.what.lower() in step.lower() for step in one.steps) else one.what,
                 "text": one.text,
                 "steps": one.steps,
                 "remark": one.remark,
-                "drawing": Markup(drawing_svg(part, evidence.inspection, one.component)),
+                "drawing": Markup(drawing_svg(part, evidence.inspection, one.component, "report")),
                 "pictures": [picture for name in one.pictures if (picture := _of_part(part, name)) is not None],
             }
         )

@@ -105,7 +105,7 @@ something could not be stored; then it is not confirmed.
     them.
 ``GET /api/jobs/JOB/report.html``, ``inspection.json``, ``decisions.csv``, ``photos/NAME``, ``rework/COMPONENT.svg``,
 ``rework/PICTURE``
-    Files of the job; a picture by the name that an instruction has for it.
+    Files of the job; a picture by the name that an instruction has for it, a drawing with ``?screen`` for a page.
 
 WebRTC
 ======

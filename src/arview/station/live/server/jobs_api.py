@@ -7,7 +7,7 @@ import hashlib
 from collections import OrderedDict
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar, get_args
+from typing import Any, Literal, TypeVar, get_args
 
 from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, Response
@@ -302,9 +302,10 @@ class JobHandlers:
         if part is None or inspection is None or inspection.find(request.path_params["component"]) is None:
             raise Refusal(404, "not_found", "there is no such component here")
         component = request.path_params["component"]
-        key = job.id, component, (job.path / "inspection.json").stat().st_mtime_ns
+        form: Literal["sheet", "screen"] = "screen" if "screen" in request.query_params else "sheet"
+        key = job.id, f"{form} {component}", (job.path / "inspection.json").stat().st_mtime_ns
         if key not in self._drawings:
-            self._drawings[key] = await self._stored(lambda: drawing_svg(part, inspection, component))
+            self._drawings[key] = await self._stored(lambda: drawing_svg(part, inspection, component, form))
             while len(self._drawings) > KEPT_DRAWINGS:
                 self._drawings.popitem(last=False)
         headers = {"Content-Security-Policy": DRAWING_POLICY}

@@ -74,6 +74,8 @@ export default {
   "card.not_inspected": "not part of the inspection",
   "card.u": "U {u} mm (k = 2)",
   "card.tolerance": "tolerance {tolerance} mm",
+  "card.tilt": "tilt {angle}°",
+  "card.twist": "twist {angle}°",
   "card.gauge": "{value} mm with U {u} against a tolerance of {tolerance} mm",
 
   "actions.label": "Actions",
@@ -99,7 +101,7 @@ export default {
   "side.files": "Files",
   "side.devices": "Devices",
   "side.view": "View",
-  "side.job": "Job",
+  "side.job": "Inspection",
 
   "verdict.pass": "PASS",
   "verdict.fail": "FAIL",
@@ -128,6 +130,7 @@ export default {
   "view.ghost": "Ghost",
   "view.edges": "Edges",
   "view.labels": "Labels",
+  "view.figures": "Technical figures",
   "view.opacity": "Opacity of the overlay",
   "view.search": "Search again",
   "view.searching": "Searching for the part again",
