@@ -332,7 +332,9 @@ def _names(subject: _Subject, panel: _Panel) -> list[str]:
             weight = ' font-weight="600"' if is_told else ""
             color = svg.INK if is_told else svg.MUTED
             attributes = f'fill="{color}" text-anchor="middle"{weight}'
-            pieces.append(svg.haloed(place[0], place[1] + 0.9, target.name, 2.6 * panel.text, attributes))
+            half = 0.3 * 2.6 * panel.text * len(target.name)
+            x = float(np.clip(place[0], panel.x + half, panel.x + panel.width - half))
+            pieces.append(svg.haloed(x, place[1] + 0.9, target.name, 2.6 * panel.text, attributes))
         elif is_told:
             pieces += _pointer(panel, center, place, target.name)
     return pieces

@@ -14,10 +14,10 @@ export function retryText({ text, inS }) {
 
 /**
  * The message about what has to be resolved before the page can show anything, or null.
- * @param state {phase, trouble, part} of the page.
- * @param acts {retry, startCamera}
+ * @param state {phase, trouble, part, status} of the page.
+ * @param acts {retry, startCamera, hasPicture: whether a picture has come}
  */
-export function blocking({ phase, trouble, part }, { retry, startCamera }) {
+export function blocking({ phase, trouble, part, status }, { retry, startCamera, hasPicture }) {
   if (phase.name === "busy") {
     return { sign: "busy", title: t("message.busy"), text: t("message.busy.text", { text: phase.text }), button: t("message.try_now"), onPress: retry };
   }
@@ -30,6 +30,9 @@ export function blocking({ phase, trouble, part }, { retry, startCamera }) {
   if (phase.name === "loading" && phase.text) return { sign: "busy", title: t("message.loading"), text: phase.text, button: "" };
   if (part?.source === "phone" && trouble) {
     return { sign: "camera", title: t("message.no_camera"), text: trouble, button: t("message.try_again"), onPress: startCamera };
+  }
+  if (part?.source === "station" && status?.feed?.state === "reconnecting" && !hasPicture) {
+    return { sign: "camera", title: t("message.no_camera"), text: t("message.station_camera"), button: "" };
   }
   return null;
 }

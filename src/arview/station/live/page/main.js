@@ -207,7 +207,7 @@ function refresh() {
   else bar.show(state.phase.name, retryText(state.phase));
   const { status } = state;
   notices.show(allNotices(state, { hasGhost: stage.hasGhost, fallback: connection.fallback }));
-  message.show(blocking(state, { retry: () => connection.retryNow(), startCamera: () => camera.start(state.part.wanted) }));
+  message.show(blocking(state, { retry: () => connection.retryNow(), startCamera: () => camera.start(state.part.wanted), hasPicture: Boolean(player?.shown?.frame) }));
   const { recording } = status ?? {};
   setPressed("record", Boolean(recording?.is_on), recording?.is_on ? "stop" : "record", recording?.is_on ? clock(recording.seconds) : t("actions.record"));
   if (recording?.is_on) find("record").setAttribute("aria-label", t("actions.record_stop", { time: clock(recording.seconds) }));

@@ -95,7 +95,7 @@ export class ComponentView {
         this.events.onTrouble(t("job.name_needed"));
         who.input.focus();
       });
-      return make("li", "", [make("label", "", [box, make("span", isMove(text) ? "move" : "", [text])], { for: `job-step-${step}` })]);
+      return make("li", "", [make("label", "", [box, make("span", `${isMove(text) ? "move" : ""} ${isLower(text, name) ? "first-up" : ""}`, [text])], { for: `job-step-${step}` })]);
     });
     const more = pictures.map((picture) => make("img", "job-drawing", [], { src: fileOf(job.id, `rework/${picture}`), alt: "" }));
     const again = make("button", "wide primary", [icon("camera"), t("job.check_again")]);
@@ -172,6 +172,9 @@ function numbersOf({ tolerance_mm: tolerance, displacement_mm: moved, tilt_deg: 
     ...(Math.abs(twist ?? 0) >= MIN_TURN_DEG ? [t("card.twist", { angle: exact(Number(twist.toFixed(1))) })] : []),
   ];
 }
+
+/** Whether a sentence begins with a small letter that is not that of a name. */
+const isLower = (text, name) => /^\p{Ll}/u.test(text) && !text.startsWith(name);
 
 /** Steps of a component that are ticked: the newest tick of each step counts. */
 function stepsDone(entries, name) {

@@ -54,7 +54,7 @@ const en = {
   "job.disk_full": "The station's disk is full: {waiting} kept on this device",
   "job.refused": "Not accepted by the station: {refused}",
   "job.photo_refused": "The station does not accept a photo: {why}",
-  "job.first_numbers": "First numbers of {count} of {all} components",
+  "job.first_numbers": "First numbers: {count} of {all} components",
 
   "job.measuring": "Measuring",
   "job.measuring_of": "{photos} photos are being measured",
@@ -163,7 +163,7 @@ const de = {
   "job.photos_count": "{photos} Fotos",
   "job.photo_number": "Foto {number}",
   "job.taken": "Aufgenommene Fotos",
-  "job.undo": "Zurück",
+  "job.undo": "Rückgängig",
   "job.undo_what": "Das letzte Foto zurücknehmen",
   "job.was_blurred": "Es war unscharf: neu aufnehmen",
   "job.take_back": "Dieses Foto zurücknehmen",
@@ -194,7 +194,7 @@ const de = {
   "job.disk_full": "Der Speicher der Station ist voll: {waiting} auf diesem Gerät aufgehoben",
   "job.refused": "Von der Station nicht angenommen: {refused}",
   "job.photo_refused": "Die Station nimmt ein Foto nicht an: {why}",
-  "job.first_numbers": "Erste Werte von {count} der {all} Bauteile",
+  "job.first_numbers": "Erste Werte: {count} von {all} Bauteilen",
 
   "job.measuring": "Messung läuft",
   "job.measuring_of": "{photos} Fotos werden gemessen",

@@ -221,7 +221,7 @@ export class Labels {
     const isPending = component.is_pending && seen?.evidence !== "displaced";
     const value = isPending ? t("parts.measuring") : seen ? seen.value : component.value_text || (component.missing ? t("parts.missing") : "");
     const u = kind === component.verdict ? component.uncertainty_mm : null;
-    const detail = seen ? seen.notes.join(", ") : component.verdict !== "pass" ? component.detail_text : "";
+    const detail = seen ? seen.notes.join(", ") : component.verdict !== "pass" ? whole(component.detail_text) : "";
     const what = [make("span", "verdict", [seen?.word ?? (component.verdict ? t(`verdict.${component.verdict}`) : component.verdict_text ?? "")])];
     if (u !== null && (seen || !detail)) what.unshift(make("span", "u", [`U ${rounded(u, u)}`]));
     if (value) what.unshift(make("span", "value", [value]));
@@ -384,6 +384,9 @@ function arrowPath([x0, y0], [x1, y1]) {
   const neck = length - head;
   return `M${at(0, shaft)}L${at(neck, shaft)}L${at(neck, half)}L${at(length, 0)}L${at(neck, -half)}L${at(neck, -shaft)}L${at(0, -shaft)}Z`;
 }
+
+/** Numbers with their names, which are never broken between the two. */
+const whole = (text) => text.split(/ {2,}/).map((one) => one.replaceAll(" ", "\u00a0")).join("  ");
 
 /** A name whose end stays whole where it is too long, so that it is shortened in its middle. */
 function middled(name) {

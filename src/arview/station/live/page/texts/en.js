@@ -59,6 +59,7 @@ export default {
   "message.loading": "Loading",
   "message.failed": "The part cannot be shown",
   "message.no_camera": "No camera",
+  "message.station_camera": "The station's camera gives no picture. Check that its plug, cable and power are in order; the picture comes by itself as soon as the camera answers.",
   "message.no_phone": "No phone yet",
   "message.no_phone.text": "The picture of the phone that joins next is shown here.",
   "message.no_picture": "No picture",
