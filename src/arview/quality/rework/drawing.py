@@ -23,8 +23,8 @@ from arview.quality.rework.types import Instruction, ReworkMove
 from arview.quality.rework.words import across, targets_of, up_of
 
 Form = Literal["sheet", "report", "screen"]
-"""A sheet says all there is to do; in a report the text stands beside the drawing; a screen is narrow, and has its own
-language."""
+"""A sheet says all there is to do; in a report text and legend stand beside the drawings; a screen is narrow, and has
+its own language."""
 WIDTH_MM = 180.0
 SCREEN_WIDTH_MM = 90.0
 SCREEN_TEXT = 1.5
@@ -419,7 +419,7 @@ def _side(subject: _Subject, panel: _Panel, key: str, form: Form) -> tuple[float
             words = f"{words}; not seen: {', '.join(hidden)}"
     bottom, below = _below(panel, "" if form == "screen" else words)
     pieces += below
-    rows = [] if form == "screen" else _legend(subject)
+    rows = _legend(subject) if form == "sheet" else []
     for k, (sample, label) in enumerate(rows):
         row = bottom + 4.4 + 4.2 * k
         pieces.append(f'<g transform="translate({x:g} {row:.2f})">{sample}</g>')
