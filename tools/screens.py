@@ -322,7 +322,8 @@ def worker_shots() -> list[Shot]:
         "worker no camera": Shot("", before=both(
             script(NO_WEBRTC), changed("/status", lambda status: status.update(lost)),
             changed("/control", lambda status: status.update(lost)),
-            lambda page: page.route("**/frame?*", lambda route: route.fulfill(status=204))), ready="document.body.dataset.state !== undefined",
+            lambda page: page.route("**/frame?*", lambda route: route.fulfill(status=204))),
+            ready="document.body.dataset.state !== undefined",
             after=lambda page: page.wait_for_timeout(2500)),
         "worker phone": Shot("", before=refused("NotAllowedError"), ready="!document.querySelector('#message').hidden"),
     }  # fmt: skip

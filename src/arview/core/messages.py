@@ -211,7 +211,7 @@ CATALOGUE = {
     "rework.replace": "replace it; it stands wrong: to be right it would have to {what}",
     "rework.on": "on {seat}",
     "rework.beside": "{reach} mm from {name}",
-    "rework.place": "{on}, {by}",
+    "rework.place": "{first}, {second}",
     "rework.as_drawn": "as its drawing shows",
     "rework.step_move": "{move}.",
     "rework.adjust_1": "Free {component} as far as its fixing allows.",

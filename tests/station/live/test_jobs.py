@@ -14,7 +14,7 @@ import pytest
 from arview.inspection import load_inspection, save_inspection
 from arview.station.live.server import hub
 from arview.station.live.stream.frames import to_jpeg
-from arview.station.walk.job import JobFolder, find_job
+from arview.station.walk.job import JobFolder, jobs_in
 from arview.station.walk.records import WalkState
 from helpers.live_client import Http, Running, running, wait
 from helpers.live_jobs import about, job_options, measured, photo, piece, quiet_worker, rough, send
@@ -48,7 +48,7 @@ def started(page: Http, serial: str | None = None) -> str:
 
 
 def on_disk(folder: Path, job: str) -> JobFolder:
-    found = find_job(folder / "jobs", job)
+    found = next((one for one in jobs_in(folder / "jobs") if one.id == job), None)
     assert found is not None
     return found
 

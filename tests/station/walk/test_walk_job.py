@@ -17,7 +17,7 @@ import pytest
 from arview.cad import Part, load_part
 from arview.errors import InputError, OutputError
 from arview.inspection import save_inspection
-from arview.station.walk.job import JobFolder, find_job, jobs_in
+from arview.station.walk.job import JobFolder, jobs_in
 from arview.station.walk.records import WalkState
 from helpers.cad_files import write_bench
 from helpers.inspections import deviation, inspection
@@ -61,7 +61,7 @@ def test_a_job_is_found_again_with_its_photos(part: Part, tmp_path: Path) -> Non
     assert (job.path / "photos" / second.name).read_bytes() == picture(2)
     assert again.state() == WalkState(photos=2) and again.inspection() is None and not again.is_ended
     assert [one.id for one in jobs_in(tmp_path / "jobs")] == [job.id]
-    assert find_job(tmp_path / "jobs", job.id) == job and find_job(tmp_path / "jobs", "other") is None
+    assert job in jobs_in(tmp_path / "jobs")
 
 
 def test_jobs_of_the_same_second_are_apart(part: Part, tmp_path: Path) -> None:

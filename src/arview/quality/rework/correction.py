@@ -104,11 +104,9 @@ def _seat_name(name: str, part: Part, middle: Array) -> str:
     model, component = part.model, part.model.component(name)
     corners = component.vertices_in_model[component.faces]
     points = np.concatenate([corners.reshape(-1, 3), corners.mean(axis=1), middle[None]])
-    counts = {}
-    for other in model.components:
-        if other.name != name:
-            pair = Model(model.name, (component, other), model.source_hash)
-            counts[other.name] = int(measurement.near_others(points, pair, 0, 0.3).sum())
+    others = [one for one in model.components if one.name != name]
+    pairs = [Model(model.name, (component, one), model.source_hash) for one in others]
+    counts = {pair.components[1].name: int(measurement.near_others(points, pair, 0, 0.3).sum()) for pair in pairs}
     best = max(counts, key=lambda one: counts[one], default="")
     return best if best and counts[best] else ""
 

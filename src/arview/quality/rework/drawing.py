@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import zlib
 from dataclasses import dataclass, replace
 from html import escape
@@ -18,9 +19,10 @@ from arview.inspection import ComponentDeviation, Finding, Inspection, exact
 from arview.quality.rework import svg
 from arview.quality.rework.correction import Correction, Standing, correction_of, standing_of
 from arview.quality.rework.instructions import make_instructions
-from arview.quality.rework.outline import ParallelView, Window, visible_lines
+from arview.quality.rework.outline import ParallelView, visible_lines
+from arview.quality.rework.panel import Panel
 from arview.quality.rework.types import Instruction, ReworkMove
-from arview.quality.rework.words import across, targets_of, up_of
+from arview.quality.rework.words import across, seen_along, targets_of, up_of
 
 Form = Literal["sheet", "report", "screen"]
 """A sheet says all there is to do; in a report text and legend stand beside the drawings; a screen is narrow, and has
@@ -40,44 +42,6 @@ HEAD_MM = 8.0
 """Room for the name; the lines of the moves come on top."""
 MAX_MAGNIFICATION = 200.0
 """Largest factor by which moves are drawn longer than they are."""
-
-
-@dataclass(frozen=True)
-class _Panel:
-    """A rectangle of the sheet that shows a window of the drawing plane.
-
-    Attributes:
-        x, y, width, height: on the sheet, mm, from its upper left corner.
-        center: (2,) of the window in the drawing plane, mm.
-        scale: mm on the sheet for each mm of the part.
-        text: factor of the letters.
-    """
-
-    x: float
-    y: float
-    width: float
-    height: float
-    center: Array
-    scale: float
-    text: float = 1.0
-
-    @property
-    def window(self) -> Window:
-        half = 0.5 / self.scale * np.array([self.width, self.height])
-        (left, low), (right, high) = self.center - half, self.center + half
-        return float(left), float(low), float(right), float(high)
-
-    def at(self, points: Array) -> Array:
-        """Points (...,2+) of the drawing plane on the sheet."""
-        middle = np.array([self.x + 0.5 * self.width, self.y + 0.5 * self.height])
-        return np.asarray((np.asarray(points)[..., :2] - self.center) * (self.scale, -self.scale) + middle)
-
-    def holds(self, place: Array, margin: float = 0.0) -> bool:
-        """Whether a place (2,) on the sheet is inside."""
-        inside = (place >= (self.x + margin, self.y + margin)) & (
-            place <= (self.x + self.width - margin, self.y + self.height - margin)
-        )
-        return bool(inside.all())
 
 
 @dataclass(frozen=True)
@@ -130,7 +94,7 @@ def drawing_svg(part: Part, inspection: Inspection, component: str, form: Form =
     )
     height = float(np.clip((high[1] - low[1] + 2.0 * MARGIN_MM) * scale, MIN_PLAN_HEIGHT_MM, MAX_PLAN_HEIGHT_MM))
     top, pieces = (0.3, []) if is_screen else _head(subject, inspection, form)
-    plan = _Panel(0.3, top, plan_width, height, 0.5 * (low + high), scale, SCREEN_TEXT if is_screen else 1.0)
+    plan = Panel(0.3, top, plan_width, height, 0.5 * (low + high), scale, SCREEN_TEXT if is_screen else 1.0)
     key = f"r{zlib.crc32(f'{part.name}/{inspection.serial}/{component}'.encode()):08x}"
     plan_bottom, drawn = _plan(subject, plan, f"{key}a", form)
     side_panel = (
@@ -199,8 +163,7 @@ def view_of(part: Part, standing: Standing, correction: Correction) -> ParallelV
     rise = across(up, normal)
     upward = rise if np.linalg.norm(rise) > 0.3 else across(-front, normal)
     upward = upward / np.linalg.norm(upward)
-    from_where = "above" if normal @ up > 0.9 else "below" if normal @ up < -0.9 else "seat" if standing.seat else "end"
-    words = sentence(f"rework.seen_{from_where}", seat=standing.seat)
+    words = seen_along(normal, standing.seat, up)
     return ParallelView(standing.center_in_model, np.stack([np.cross(upward, normal), upward, normal]), words)
 
 
@@ -236,7 +199,7 @@ def _head(subject: _Subject, inspection: Inspection, form: Form) -> tuple[float,
     return HEAD_MM + 4.0 * len(lines), pieces
 
 
-def _framed(panel: _Panel, key: str, pieces: list[str]) -> list[str]:
+def _framed(panel: Panel, key: str, pieces: list[str]) -> list[str]:
     """Pieces that are cut at the edge of their panel, and its frame."""
     box = f'x="{panel.x:g}" y="{panel.y:g}" width="{panel.width:g}" height="{panel.height:g}"'
     return [
@@ -247,7 +210,7 @@ def _framed(panel: _Panel, key: str, pieces: list[str]) -> list[str]:
     ]
 
 
-def _outlines(subject: _Subject, panel: _Panel, with_others: bool) -> list[str]:
+def _outlines(subject: _Subject, panel: Panel, with_others: bool) -> list[str]:
     """Everything that a panel shows of the part: others thin, the design place solid, the measured one dashed."""
     view, window = subject.view, panel.window
     pieces = []
@@ -265,7 +228,7 @@ def _outlines(subject: _Subject, panel: _Panel, with_others: bool) -> list[str]:
     return pieces
 
 
-def _plan(subject: _Subject, panel: _Panel, key: str, form: Form) -> tuple[float, list[str]]:
+def _plan(subject: _Subject, panel: Panel, key: str, form: Form) -> tuple[float, list[str]]:
     """Where the plan ends on the sheet, and its pieces: the component among its neighbours, scale and remark."""
     pieces = _outlines(subject, panel, with_others=True)
     pieces += _names(subject, panel)
@@ -283,7 +246,7 @@ def _plan(subject: _Subject, panel: _Panel, key: str, form: Form) -> tuple[float
     return bottom + 4.0 * len(lines) + 1.5, [*framed, *below, *notes]
 
 
-def _below(panel: _Panel, words: str) -> tuple[float, list[str]]:
+def _below(panel: Panel, words: str) -> tuple[float, list[str]]:
     """Where a panel's scale bar and caption end, and both."""
     y = panel.y + panel.height + 5.0
     step = svg.nice(0.3 * panel.width / panel.scale)
@@ -294,7 +257,7 @@ def _below(panel: _Panel, words: str) -> tuple[float, list[str]]:
     return y + 2.4 + 3.6 * len(lines), [svg.scale_bar(panel.x, y, step, panel.scale, 2.5 * panel.text), *lines]
 
 
-def _turn_arrow(subject: _Subject, panel: _Panel) -> list[str]:
+def _turn_arrow(subject: _Subject, panel: Panel) -> list[str]:
     """The sense of a turn about the direction of the view."""
     turn = None if subject.instruction is None else subject.instruction.turn
     if turn is None:
@@ -314,7 +277,7 @@ def _turn_arrow(subject: _Subject, panel: _Panel) -> list[str]:
     ]
 
 
-def _names(subject: _Subject, panel: _Panel) -> list[str]:
+def _names(subject: _Subject, panel: Panel) -> list[str]:
     """Names of neighbours in the window, and arrows at its edge to those that the instruction names."""
     told = subject.instruction
     sentence = "" if told is None else f"{told.what} {told.place} "
@@ -324,7 +287,7 @@ def _names(subject: _Subject, panel: _Panel) -> list[str]:
     for target in targets_of(subject.part):
         if target.name in (subject.nominal.name, subject.standing.seat) or target.normal_in_model is not None:
             continue
-        is_told = f" {target.name}{_after(sentence, target.name)}" in sentence
+        is_told = re.search(rf"(?<!\w){re.escape(target.name)}(?!\w)", sentence) is not None
         place = panel.at(subject.view.to_plane(target.point_in_model))
         if panel.holds(place, 2.0):
             if low[0] < place[0] < high[0] and high[1] < place[1] < low[1] and not is_told:
@@ -340,18 +303,7 @@ def _names(subject: _Subject, panel: _Panel) -> list[str]:
     return pieces
 
 
-def _after(sentence: str, name: str) -> str:
-    """The character behind the first whole mention of a name, so that post_1 is not found in post_12."""
-    at = sentence.find(f" {name}")
-    while at >= 0:
-        follows = sentence[at + 1 + len(name) : at + 2 + len(name)]
-        if not (follows.isalnum() or follows == "_"):
-            return follows
-        at = sentence.find(f" {name}", at + 1)
-    return "\0"
-
-
-def _pointer(panel: _Panel, center: Array, place: Array, name: str) -> list[str]:
+def _pointer(panel: Panel, center: Array, place: Array, name: str) -> list[str]:
     """The name of something outside at the edge of a panel, with a small sign of where it lies; none straight behind.
 
     The sign is open and pale: the only arrows of a drawing are those of the moves.
@@ -385,13 +337,13 @@ def _is_whole(subject: _Subject) -> bool:
     return subject.deviation.finding is Finding.MISSING or subject.measured is None
 
 
-def _side_panel(subject: _Subject, x: float, y: float, width: float) -> _Panel:
+def _side_panel(subject: _Subject, x: float, y: float, width: float) -> Panel:
     """The second panel: the displacement magnified, or the whole part for a missing component."""
     panel = (_whole_part if _is_whole(subject) else _magnified)(subject, x, y, width)
     return panel if width == SIDE_WIDTH_MM else replace(panel, text=SCREEN_TEXT)
 
 
-def _about(subject: _Subject, panel: _Panel) -> str:
+def _about(subject: _Subject, panel: Panel) -> str:
     """What a drawing on a screen shows, as JSON."""
     one = subject.deviation
     is_whole = _is_whole(subject)
@@ -405,7 +357,7 @@ def _about(subject: _Subject, panel: _Panel) -> str:
     return json.dumps(with_messages(told), ensure_ascii=False)
 
 
-def _side(subject: _Subject, panel: _Panel, key: str, form: Form) -> tuple[float, list[str]]:
+def _side(subject: _Subject, panel: Panel, key: str, form: Form) -> tuple[float, list[str]]:
     """Where the second panel ends, and its pieces; with the legend."""
     x = panel.x
     if _is_whole(subject):
@@ -427,34 +379,34 @@ def _side(subject: _Subject, panel: _Panel, key: str, form: Form) -> tuple[float
     return bottom + 4.4 + 4.2 * len(rows), pieces
 
 
-def _moves_along_view(subject: _Subject, panel: _Panel) -> list[ReworkMove]:
+def _moves_along_view(subject: _Subject, panel: Panel) -> list[ReworkMove]:
     """Moves that are too short to be seen in a panel, because they are along the view or small."""
     moves = () if subject.instruction is None else subject.instruction.moves
     return [move for move in moves if _drawn_length(subject, panel, move) < 0.8]
 
 
-def _drawn_length(subject: _Subject, panel: _Panel, move: ReworkMove) -> float:
+def _drawn_length(subject: _Subject, panel: Panel, move: ReworkMove) -> float:
     step = subject.view.axes[:2] @ np.array(move.axis_in_model) * move.distance_mm * panel.scale
     return float(np.hypot(*step))
 
 
-def _whole_part(subject: _Subject, x: float, y: float, width: float) -> _Panel:
+def _whole_part(subject: _Subject, x: float, y: float, width: float) -> Panel:
     corners = np.array(np.meshgrid(*subject.part.model.bounds_in_model.T)).reshape(3, -1).T
     flat = subject.view.to_plane(corners)[:, :2]
     size = flat.max(axis=0) - flat.min(axis=0)
     scale = float(min((width - 4.0) / size[0], (width - 4.0) / size[1]))
-    return _Panel(x, y, width, width, 0.5 * (flat.min(axis=0) + flat.max(axis=0)), scale)
+    return Panel(x, y, width, width, 0.5 * (flat.min(axis=0) + flat.max(axis=0)), scale)
 
 
-def _magnified(subject: _Subject, x: float, y: float, width: float) -> _Panel:
+def _magnified(subject: _Subject, x: float, y: float, width: float) -> Panel:
     one = subject.deviation
     away = float(np.hypot(*(subject.measured_point - subject.design_point)))
     reach = 1.15 * max(one.tolerance_mm or 0.0, away + (one.uncertainty_mm or 0.0), 1e-3)
     scale = min(MAX_MAGNIFICATION, svg.nice(0.5 * width / reach, (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0)))
-    return _Panel(x, y, width, width, subject.design_point, scale)
+    return Panel(x, y, width, width, subject.design_point, scale)
 
 
-def _displacement(subject: _Subject, panel: _Panel) -> list[str]:
+def _displacement(subject: _Subject, panel: Panel) -> list[str]:
     """Tolerance zone, design point, measured point with its U, and the moves from one to the other."""
     one, told = subject.deviation, subject.instruction
     pieces = _outlines(subject, panel, with_others=False)
@@ -487,7 +439,7 @@ def _displacement(subject: _Subject, panel: _Panel) -> list[str]:
     return pieces + [_move_label(panel, *label, middle) for label in labels]
 
 
-def _move_label(panel: _Panel, start: Array, end: Array, text: str, middle: Array) -> str:
+def _move_label(panel: Panel, start: Array, end: Array, text: str, middle: Array) -> str:
     """Length of a move beside its arrow, on the side away from the middle of all arrows."""
     arm = end - start
     across_arm = np.array([-arm[1], arm[0]]) / float(np.hypot(*arm))

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import re
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import reduce
 
@@ -24,6 +25,7 @@ from arview.quality.rework.words import (
     in_named_steps,
     lateral_directions,
     name_of,
+    seen_along,
     targets_of,
     up_of,
 )
@@ -93,11 +95,11 @@ def _instruction(one: ComponentDeviation, part: Part, targets: Sequence[Target])
     moves = _moves(one, standing, correction, names, part)
     turn = _turn(one, standing, correction, names, part)
     texts = [move.text for move in moves] + ([] if turn is None else [turn.text])
-    what = _then(texts) if texts else sentence("rework.bring")
+    what = _joined("rework.then", texts) if texts else sentence("rework.bring")
     if settings.name == "shim":
         texts = [*_shims(standing, moves, turn, names, correction), *texts]
     usual = settings.steps or STEPS.get(settings.name, STEPS["adjust"])
-    steps = _filled((*usual, LAST_STEP), one.name, _then(texts) if texts else what, place)
+    steps = _filled((*usual, LAST_STEP), one.name, _joined("rework.then", texts) if texts else what, place)
     if settings.name == "replace":
         what = sentence("rework.replace", what=what)
     return Instruction(
@@ -114,24 +116,29 @@ def _instruction(one: ComponentDeviation, part: Part, targets: Sequence[Target])
     )
 
 
-def _then(texts: Sequence[str]) -> str:
-    """Moves and turns one after the other, in one line."""
-    return reduce(lambda first, second: sentence("rework.then", first=first, second=second), texts)
+def _joined(key: str, texts: Iterable[str]) -> str:
+    """Several texts as one, each with the next by a sentence with the values ``first`` and ``second``."""
+    return reduce(lambda first, second: sentence(key, first=first, second=second), texts)
 
 
 def _filled(steps: Sequence[str], component: str, move: str, place: str) -> tuple[str, ...]:
-    """Steps with their values, of the part file or keys of sentences; each begins with a capital and ends with a stop."""
-    filled = []
-    for step in steps:
-        values = {"component": component, "move": move, "place": place}
-        if step in CATALOGUE:
-            text = sentence(step, **values)
-            filled.append(Message(f"{text[:1].upper()}{text[1:]}", text.key, text.values))
-            continue
-        values["move"] = f"{move[:1].upper()}{move[1:]}"
-        told = reduce(lambda text, name: text.replace(f"{{{name}}}", values[name]), values, step).strip()
-        filled.append(told if told[-1:] in ".!?" else f"{told}.")
-    return tuple(filled)
+    """Steps with their values, keys of sentences or of the part file; moves begin with a capital, all have a stop."""
+    values = {"component": component, "move": move, "place": place}
+    own = values | {"move": f"{move[:1].upper()}{move[1:]}"}
+    told = [
+        sentence(step, **values)
+        if step in CATALOGUE
+        else re.sub(r"\{(component|move|place)\}", lambda found: own[found[1]], step).strip()
+        for step in steps
+    ]
+    return tuple(
+        Message(f"{text[:1].upper()}{text[1:]}", text.key, text.values)
+        if isinstance(text, Message)
+        else text
+        if text[-1:] in ".!?"
+        else f"{text}."
+        for text in told
+    )
 
 
 def names_for(standing: Standing, part: Part, targets: Sequence[Target], settings: ReworkSettings) -> _Names:
@@ -233,14 +240,20 @@ def _turn(
     u = correction.turn_uncertainty_rad(own)
     if abs(twist) > max(u, np.deg2rad(MIN_TURN_DEG)):
         sense = "counter_clockwise" if twist > 0 else "clockwise"
-        texts.append(sentence(f"rework.{sense}", angle=_degrees(abs(twist), u), seen=_seen(standing, part)))
+        texts.append(
+            sentence(
+                f"rework.{sense}",
+                angle=_degrees(abs(twist), u),
+                seen=seen_along(standing.axis_in_model, standing.seat, up_of(part)),
+            )
+        )
         kept = kept + own * twist
     if not texts:
         return None
     angle = float(np.linalg.norm(kept))
     axis = kept / angle
     u = correction.turn_uncertainty_rad(axis)
-    return ReworkTurn(_and(texts), _three(axis), float(np.rad2deg(angle)), float(np.rad2deg(u)))
+    return ReworkTurn(_joined("rework.and", texts), _three(axis), float(np.rad2deg(angle)), float(np.rad2deg(u)))
 
 
 def _tilt_text(tilt: Array, u: float, standing: Standing, names: _Names) -> str:
@@ -252,21 +265,7 @@ def _tilt_text(tilt: Array, u: float, standing: Standing, names: _Names) -> str:
         (size, steps[0].direction.text)
     ]
     parts = [sentence("rework.degrees", angle=_degrees(length, u), direction=text) for length, text in named]
-    return sentence("rework.tilt", parts=_and(parts))
-
-
-def _and(texts: Sequence[str]) -> str:
-    return reduce(lambda first, second: sentence("rework.and", first=first, second=second), texts)
-
-
-def _seen(standing: Standing, part: Part) -> str:
-    """From where a turn is seen for which the own axis points at the eye."""
-    rise = float(standing.axis_in_model @ up_of(part))
-    if rise > 0.9:
-        return sentence("rework.seen_above")
-    if rise < -0.9:
-        return sentence("rework.seen_below")
-    return sentence("rework.seen_seat", seat=standing.seat) if standing.seat else sentence("rework.seen_end")
+    return sentence("rework.tilt", parts=_joined("rework.and", parts))
 
 
 def _shims(
@@ -322,28 +321,27 @@ def _remark(
     if moves and turn is not None:
         sentences.append(sentence("rework.of_point", point=standing.point))
     told = dict.fromkeys(sentences)
-    return reduce(lambda first, second: sentence("rework.both", first=first, second=second), told) if told else ""
+    return _joined("rework.both", told) if told else ""
 
 
 def _place(standing: Standing, targets: Sequence[Target]) -> str:
     """Where a component belongs: on what, and how far from two things beside it in different directions."""
-    aims = []
-    for target in targets:
-        aim = None
-        if target.name not in (standing.component, standing.seat):
-            aim = aim_of(target, standing.center_in_model, standing.normal_in_model)
-        if aim is not None and target.normal_in_model is None:
-            aims.append((aim[1] * (1.0 + target.cost), target.name, *aim))
-    aims.sort(key=lambda one: one[0])
+    aims = sorted(
+        (aim[1] * (1.0 + target.cost), target.name, *aim)
+        for target in targets
+        if target.normal_in_model is None
+        and target.name not in (standing.component, standing.seat)
+        and (aim := aim_of(target, standing.center_in_model, standing.normal_in_model)) is not None
+    )
     chosen = aims[:1]
     for one in aims[1:]:
         if abs(float(one[2] @ chosen[0][2])) < 0.87:
             chosen.append(one)
             break
     parts = [sentence("rework.beside", reach=f"{reach:.0f}", name=name) for _, name, _, reach in chosen]
-    beside = [_and(parts)] if parts else []
-    told = [sentence("rework.on", seat=standing.seat), *beside] if standing.seat else beside
-    return reduce(lambda on, by: sentence("rework.place", on=on, by=by), told) if told else sentence("rework.as_drawn")
+    on = [sentence("rework.on", seat=standing.seat)] if standing.seat else []
+    told = [*on, *([_joined("rework.and", parts)] if parts else [])]
+    return _joined("rework.place", told) if told else sentence("rework.as_drawn")
 
 
 def amount(value: float, uncertainty: float) -> str:

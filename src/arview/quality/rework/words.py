@@ -105,18 +105,21 @@ def targets_of(part: Part, absent: Sequence[str] = (), wrong: Sequence[str] = ()
         absent: components that are missing from the specimen, which are not named.
         wrong: components that are out of tolerance, which are named last.
     """
-    found = []
-    for datum in part.datums:
-        if datum.feature == "fit":
-            continue
-        normal = np.array(datum.direction_in_model) if datum.feature == "plane" else None
-        found.append(Target(datum.feature_name, np.array(datum.point_in_model), normal))
-    for component in part.model.components:
-        if component.name in absent:
-            continue
-        cost = COMPONENT_COST + WRONG_COST * (component.name in wrong)
-        found.append(Target(component.name, component.bounds_in_model.mean(axis=0), None, cost))
-    return found
+    features = (
+        Target(
+            datum.feature_name,
+            np.array(datum.point_in_model),
+            np.array(datum.direction_in_model) if datum.feature == "plane" else None,
+        )
+        for datum in part.datums
+        if datum.feature != "fit"
+    )
+    components = (
+        Target(one.name, one.bounds_in_model.mean(axis=0), None, COMPONENT_COST + WRONG_COST * (one.name in wrong))
+        for one in part.model.components
+        if one.name not in absent
+    )
+    return [*features, *components]
 
 
 def lateral_directions(
@@ -138,11 +141,11 @@ def lateral_directions(
         seat: name of what it stands on, which is no target either.
     """
     bases = {settings.name for settings in part.settings if settings.role == "base"} | {component, seat}
-    aims = []
-    for target in targets:
-        aim = None if target.name in bases else aim_of(target, center, normal)
-        if aim is not None:
-            aims.append((target, *aim))
+    aims = [
+        (target, *aim)
+        for target in targets
+        if target.name not in bases and (aim := aim_of(target, center, normal)) is not None
+    ]
     nearest = min((reach for _, _, reach in aims), default=1.0)
     found = []
     for target, direction, reach in aims:
@@ -240,6 +243,13 @@ def _best_steps(vector: Array, pool: Sequence[NamedDirection], sideways: float) 
                 ]
                 best = (cost, sorted(steps, key=lambda step: -step.length))
     return best[1]
+
+
+def seen_along(direction: Array, seat: str, up: Array) -> Message:
+    """From where something is seen when a direction (3,) points at the eye, away from what it stands on."""
+    rise = float(direction @ up)
+    where = "above" if rise > 0.9 else "below" if rise < -0.9 else "seat" if seat else "end"
+    return sentence(f"rework.seen_{where}", seat=seat)
 
 
 def name_of(direction: Array, found: Sequence[NamedDirection]) -> str | Message:

@@ -360,11 +360,6 @@ def jobs_in(folder: str | Path) -> list[JobFolder]:
     return found
 
 
-def find_job(folder: str | Path, job_id: str) -> JobFolder | None:
-    """The job of a name, also of a re-check; None if there is none."""
-    return next((job for job in jobs_in(folder) if job.id == job_id), None)
-
-
 def start_worker(job: JobFolder) -> subprocess.Popen[bytes]:
     """Start the process that measures a job; it ends by itself when the job is done.
 

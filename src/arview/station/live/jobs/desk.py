@@ -268,8 +268,7 @@ class JobDesk:
         """More photos come after all: a measurement that runs is ended, and begins anew after the next end."""
         job.reopen()
         self.workers.stop(job)
-        if job.state().stage == "measuring":
-            job.write_state(walk.WalkState(photos=len(job.photos())))
+        job.write_state(walk.WalkState(photos=len(job.photos())))
         self.changed(job)
 
     def close(self) -> Callable[[], None]:

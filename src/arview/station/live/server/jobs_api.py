@@ -167,12 +167,8 @@ class JobHandlers:
         answer = await asyncio.to_thread(self._desk.board.uploads(job).state, name)
         if isinstance(answer, Upload):
             return JSONResponse({"offset": answer.offset})
-        if quality.is_attachment(answer):
-            path = await asyncio.to_thread(_photo_file, job, answer)
-            return JSONResponse({"photo": answer, "offset": 0 if path is None else path.stat().st_size})
-        photos = await asyncio.to_thread(job.photos)
-        size = next((photo.bytes for photo in photos if photo.name == answer), 0)
-        return JSONResponse({"photo": answer, "offset": size})
+        path = await asyncio.to_thread(_photo_file, job, answer)
+        return JSONResponse({"photo": answer, "offset": 0 if path is None else path.stat().st_size})
 
     async def add_piece(self, request: Request) -> Response:
         """Take a piece of a photo; the last one is answered when the photo is on the disk."""
@@ -227,8 +223,8 @@ class JobHandlers:
     async def take_back(self, request: Request) -> Response:
         """Take a photo back, until the walk has ended."""
         job = await self._job(request)
-        why = request.query_params.get("why", "unwanted")[:40]
-        await self._stored(lambda: job.take_back(request.path_params["name"], why))
+        name, why = request.path_params["name"], request.query_params.get("why", "unwanted")[:40]
+        await self._stored(lambda: job.take_back(name, why))
         await asyncio.to_thread(self._desk.lost, job)
         await asyncio.to_thread(self._desk.changed, job)
         return await self._document(job)

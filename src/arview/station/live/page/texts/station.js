@@ -134,7 +134,7 @@ const de = {
   "rework.replace": "ersetzen; es sitzt falsch, nötig wäre: {what}",
   "rework.on": "auf {seat}",
   "rework.beside": "{reach} mm von {name} entfernt",
-  "rework.place": "{on}, {by}",
+  "rework.place": "{first}, {second}",
   "rework.as_drawn": "wie in seiner Zeichnung",
   "rework.step_move": "{move}.",
   "rework.adjust_1": "{component} so weit lösen, wie die Befestigung erlaubt.",
