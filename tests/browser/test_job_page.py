@@ -173,7 +173,7 @@ def test_a_photo_is_taken_by_itself_once_for_each_number(chromium: Any, server: 
             until(page, lambda number=number: len(jobs.stored) == number)
             page.wait_for_timeout(1200)
             assert len(jobs.stored) == number
-        assert page.inner_text(".hud-count").startswith("2 of 20")
+        assert page.inner_text(".hud-count") == "2 photos"
     for about in jobs.begun.values():
         assert about["source"] == "still" and about["media_type"] == "image/jpeg"
         assert len(about["hint"]["cam_from_model"]) == 16 and about["hint"]["camera"]["width"] == WIDTH
@@ -185,7 +185,7 @@ def test_result_comes_without_a_reload_and_is_signed(chromium: Any, server: Runn
         page.click("#job-hud .shutter")
         page.click("#job-hud .hud-done")
         until(page, lambda: ("end", {}) in jobs.said and len(jobs.stored) == 1)
-        until(page, lambda: "placing photos" in page.inner_text("#job"))
+        until(page, lambda: "1 photos are being measured" in page.inner_text("#job"))
         found = {
             "verdict": "fail",
             "sentence": "1 of 11 is out of tolerance",

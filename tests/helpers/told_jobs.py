@@ -60,7 +60,8 @@ class ToldJobs:
             "id": name, "part": "bracket_plate/part.toml", "part_name": "bracket_plate", "serial": "BP-1",
             "created": "2026-11-27T06:12:00Z", "parent": None, "photos": [], "attachments": [], "inspection": None,
             "rework": [], "decisions": [], "signed": None,
-            "is_ended": False, "measuring_s": None, "expected_s": None, "rechecks": [], "before_after": [], "components": None,
+            "is_ended": False, "measuring_s": None, "expected_s": None,
+            "rechecks": [], "before_after": [], "components": None,
             "state": {"stage": "collecting", "text": "", "photos": 0, "placed": 0, "step": "", "done": 0, "total": 0,
                       "is_rough": False, "cloud": "waiting"},
         }  # fmt: skip

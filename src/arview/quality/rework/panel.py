@@ -31,6 +31,7 @@ class Panel:
 
     @property
     def window(self) -> Window:
+        """What it shows of the drawing plane, mm."""
         half = 0.5 / self.scale * np.array([self.width, self.height])
         (left, low), (right, high) = self.center - half, self.center + half
         return float(left), float(low), float(right), float(high)

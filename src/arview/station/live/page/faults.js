@@ -45,8 +45,9 @@ export function blocking({ phase, trouble, part, status }, { retry, startCamera,
 export function allNotices({ status, part }, { hasGhost, fallback }) {
   const shown = [...(status?.notices ?? [])];
   if (status?.feed && ["reconnecting", "frozen"].includes(status.feed.state) && !shown.some((one) => one.code.startsWith("source_"))) {
-    shown.push({ level: "error", text: status.feed.text });
+    shown.push({ code: `source_${status.feed.state}`, level: "error", text: status.feed.text });
   }
+  for (const [index, one] of shown.entries()) if (one.code?.startsWith("source_")) shown[index] = { ...one, text: t("notice.source", { text: one.text }) };
   const isTold = shown.some((one) => one.code === "inspection_future");
   const inspections = part ? partsOf(part).map((one) => one.inspection).filter(Boolean) : [];
   const ahead = Math.max(0, ...inspections.map(({ created }) => (Date.parse(created) - Date.now()) / 1000), ...inspections.map(({ age_s }) => -age_s));

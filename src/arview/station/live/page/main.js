@@ -189,7 +189,7 @@ function refreshState(shown = player?.shown) {
     return bar.show("frozen", ago < 2 ? t("frozen.now") : t("frozen.ago", { seconds: ago }));
   }
   if (phase.name !== "connected") return bar.show(phase.name, retryText(phase));
-  if (part?.source === "phone" && trouble) return bar.show("trouble", trouble);
+  if (part?.source === "phone" && trouble) return bar.show("trouble"); // why, and what to do, is in the message
   if (!player.isAnswered(nowMs)) {
     const words = status?.feed?.text || t(camera.isOn || part?.source !== "phone" ? "why.station" : "why.camera");
     return bar.show("waiting", words);

@@ -46,6 +46,7 @@ export default {
   "notices.more": "{count} weitere Hinweise",
   "notices.fewer": "weniger Hinweise",
   "notice.inspection_old": "Veraltete Prüfung: {text}",
+  "notice.source": "{text}. Prüfen Sie Stecker, Kabel und Strom der Kamera.",
   "notice.no_webgl": "dieser Browser hat kein WebGL 2: Die Station zeichnet die Überlagerung",
   "notice.no_webrtc": "dieser Browser hat kein WebRTC: Bilder werden einzeln gesendet, das ist langsamer",
   "notice.future": "Prüfung aus der Zukunft: Ihr Datum liegt {ahead} nach jetzt; prüfen Sie die Uhren dieses Geräts und der Station",

@@ -46,6 +46,7 @@ export default {
   "notices.more": "{count} more notices",
   "notices.fewer": "fewer notices",
   "notice.inspection_old": "Stale inspection: {text}",
+  "notice.source": "{text}. Check plug, cable and power of the camera.",
   "notice.no_webgl": "this browser has no WebGL 2: the station draws the overlay",
   "notice.no_webrtc": "this browser has no WebRTC: pictures are sent one by one, which is slower",
   "notice.future": "Inspection from the future: it is dated {ahead} later than now; check the clocks of this device and of the station",

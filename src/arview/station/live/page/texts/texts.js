@@ -65,6 +65,7 @@ function inLanguage(value, messages) {
   const isUnknown = typeof value.text === "string" && value.text !== "" && made.text === value.text;
   // A notice has a sentence for its code; the state of a job has its stage, and its text is kept as it came.
   if (isUnknown && typeof value.code === "string" && hasText(`code.${value.code}`)) made.text = t(`code.${value.code}`);
+  if (isUnknown && value.kind === "station" && hasText(`code.source_${value.state}`)) made.text = t(`code.source_${value.state}`);
   if (isUnknown && typeof value.stage === "string") Object.assign(made, { text: "", original: value.text });
   return made;
 }
