@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from dataclasses import replace
 from xml.etree import ElementTree
@@ -169,3 +170,16 @@ def test_steps_of_scales_and_lines_of_texts() -> None:
     assert [nice(value) for value in (0.9, 1.0, 4.9, 50.0, 199.0, 0.024)] == [0.5, 1.0, 2.0, 50.0, 100.0, 0.02]
     lines = wrapped("one two three four five six seven", 20.0, 3.0)
     assert " ".join(lines) == "one two three four five six seven" and max(len(line) for line in lines) <= 11
+
+
+def test_on_a_screen_letters_are_large_and_what_is_shown_is_told_as_messages() -> None:
+    found = inspection(WALL.model, [off(WALL, "block_1", (-2.0, 0.0, 0.0))])
+    text = drawing_svg(WALL, found, "block_1", "screen")
+    root = ElementTree.fromstring(text)
+    width = float(root.get("viewBox", "").split()[2])
+    sizes = [float(one.get("font-size", "0")) for one in root.iter(f"{NS}text")]
+    assert sizes and min(sizes) * 336.0 / width >= 14.0  # px on a phone of 360 px
+    (about,) = root.iter(f"{NS}metadata")
+    told = json.loads(about.text or "")
+    assert told["messages"][told["text"]]["key"].startswith("rework.seen_") and told["tolerance"] == "0.5"
+    assert not any("design place" in one or "magnified" in one for one in texts(root))

@@ -6,7 +6,7 @@ import { hasText, t } from "../texts/texts.js";
 import { fileOf } from "./api.js";
 import { Drawing } from "./drawing.js";
 import { DecisionPhoto, titleOf } from "./decision_photo.js";
-import { latestDecisions } from "./results.js";
+import { isOpen, latestDecisions } from "./results.js";
 import { verdictWord } from "./verdicts.js";
 
 const MIN_TURN_DEG = 0.1; // smaller turns are not told
@@ -51,7 +51,7 @@ export class ComponentView {
     const ticks = stepsDone(job.decisions, name);
     const isDone = job.state.stage === "done";
     this.#update("decision", [job.id, name, decision, isDone], () => (isDone ? this.#decision(job, name, decision) : []));
-    this.#update("result", [job.id, name, component, instruction, [...ticks], isDone], () => this.#result(job, component, instruction, ticks));
+    this.#update("result", [job.id, name, component, instruction, [...ticks], isDone, isOpen(job)], () => this.#result(job, component, instruction, ticks));
   }
 
   /** Make one half of the view again if what it shows has changed: what is typed in the other half stays. */
@@ -63,13 +63,13 @@ export class ComponentView {
   }
 
   #result(job, component, instruction, ticks) {
-    const { name } = component;
+    const { name } = component, isRough = isOpen(job);
     const back = make("button", "job-back", [icon("back"), t("job.back_to_result")]);
     back.addEventListener("click", () => this.events.onBack());
     return [
       make("div", "job-head", [back, make("h3", "", [name])]),
-      make("div", `job-banner ${component.verdict}`, [
-        make("div", "what", [icon(component.verdict), make("b", "", [verdictWord(component.verdict)]), make("b", "big", [component.value_text])]),
+      make("div", `job-banner ${isRough ? "rough" : component.verdict}`, [
+        make("div", "what", [icon(isRough ? "busy" : component.verdict), make("b", "", [isRough ? t("job.provisional") : verdictWord(component.verdict)]), make("b", "big", [component.value_text])]),
         make("p", "numbers-of", numbersOf(component).map((text) => make("span", "", [text]))),
       ]),
       ...(instruction ? this.#rework(job, name, instruction, ticks) : []),

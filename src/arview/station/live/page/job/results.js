@@ -66,7 +66,7 @@ export class ResultsView {
     }
     const cancel = make("button", "wide", [icon("stop"), t("job.cancel")]);
     cancel.addEventListener("click", () => this.events.onCancel());
-    const words = waiting ? t("job.sending", { waiting }) : t("job.measuring_of", { photos: photos.length });
+    const words = waiting ? t("job.sending", { waiting }) : t("job.measuring_of", { photos: t(photos.length === 1 ? "job.photos_one" : "job.photos_count", { photos: photos.length }) });
     return make("div", "job-progress", [make("p", "", [icon("busy"), make("b", "", [words])]), this.bar, this.left, cancel], { role: "status" });
   }
 
@@ -153,7 +153,7 @@ export class ResultsView {
 const original = (state) => (state.original ? [make("details", "", [make("summary", "", [t("job.failed_why")]), make("p", "", [state.original], { lang: "en" })])] : []);
 
 /** Whether numbers are still to come: none that is shown is a verdict. */
-const isOpen = ({ state }) => Boolean(state.is_rough) || ["collecting", "measuring"].includes(state.stage);
+export const isOpen = ({ state }) => Boolean(state.is_rough) || ["collecting", "measuring"].includes(state.stage);
 
 /** A length as text; a dash where there is none. */
 const mm = (value) => make("b", "", [value === null || value === undefined ? "–" : `${decimal(value.toFixed(2))} mm`]);

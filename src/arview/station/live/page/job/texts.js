@@ -57,7 +57,7 @@ const en = {
   "job.first_numbers": "First numbers: {count} of {all} components",
 
   "job.measuring": "Measuring",
-  "job.measuring_of": "{photos} photos are being measured",
+  "job.measuring_of": "Measuring: {photos}",
   "job.left": "About {minutes} min left",
   "job.left_soon": "Less than 1 min left",
   "job.left_unknown": "How long it will take is not known yet",
@@ -197,7 +197,7 @@ const de = {
   "job.first_numbers": "Erste Werte: {count} von {all} Bauteilen",
 
   "job.measuring": "Messung läuft",
-  "job.measuring_of": "{photos} Fotos werden gemessen",
+  "job.measuring_of": "Messung läuft: {photos}",
   "job.left": "Noch etwa {minutes} min",
   "job.left_soon": "Noch weniger als 1 min",
   "job.left_unknown": "Wie lange es dauert, ist noch nicht bekannt",
