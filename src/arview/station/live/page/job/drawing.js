@@ -1,10 +1,10 @@
 // The drawing of a rework: the picture of the station, and what it shows in the words of the page.
 
 import { make } from "../icons.js";
-import { translated } from "../texts/texts.js";
-import { ask } from "../transport/api.js";
-import { t } from "../texts/texts.js";
+import { decimal, t, translated } from "../texts/texts.js";
 import { fileOf } from "./api.js";
+
+const LENGTH = /^[\d.]+ ?(mm|°)$/; // texts that are numbers, not names
 
 export class Drawing {
   constructor(job, name) {
@@ -16,16 +16,14 @@ export class Drawing {
   }
 
   async #load(address) {
-    try {
-      const text = await (await ask(address)).text();
-      const about = new DOMParser().parseFromString(text, "image/svg+xml").querySelector("metadata")?.textContent;
-      this.picture.src = URL.createObjectURL(new Blob([text], { type: "image/svg+xml" }));
-      this.picture.addEventListener("load", () => URL.revokeObjectURL(this.picture.src), { once: true });
-      this.about.replaceChildren(...(about ? this.#words(translated(JSON.parse(about))) : []));
-      this.element.hidden = false;
-    } catch (error) {
-      if (error.code === undefined) throw error; // without a drawing the steps say all
-    }
+    const answer = await fetch(address, { credentials: "same-origin" }).catch(() => null); // a station that measures takes its time
+    if (!answer?.ok) return; // without a drawing the steps say all
+    const drawn = new DOMParser().parseFromString(await answer.text(), "image/svg+xml"), about = drawn.querySelector("metadata")?.textContent;
+    for (const one of drawn.querySelectorAll("text")) if (LENGTH.test(one.textContent)) one.textContent = decimal(one.textContent);
+    this.picture.src = URL.createObjectURL(new Blob([new XMLSerializer().serializeToString(drawn)], { type: "image/svg+xml" }));
+    this.picture.addEventListener("load", () => URL.revokeObjectURL(this.picture.src), { once: true });
+    this.about.replaceChildren(...(about ? this.#words(translated(JSON.parse(about))) : []));
+    this.element.hidden = false;
   }
 
   /** What is drawn: the plan with its view, the magnification, and the lines. */
