@@ -126,6 +126,7 @@ CATALOGUE = {
     "walk.provisional": "{count} photos; provisional numbers from {placed}",
     "walk.measuring": "measuring",
     "walk.first": "reading the first measurement",
+    "walk.checked_again": "{names} checked again {time}",
     # Guided capture.
     "capture.not_tracked": "part not tracked",
     "capture.uncertain": "pose uncertain",

@@ -212,8 +212,9 @@ class Annotations:
             paint.put_sprite(canvas, sprite, label.box.x, label.box.y, label.box.opacity)
         if laid_out.unlabelled:
             note = banner_sprite("", f"without a label: {laid_out.unlabelled}", self._size_px, self._camera.width)
-            left = (self._camera.width - note.width) // 2
-            paint.put_sprite(canvas, note, left, self._bottom - note.height - self._margin_px)
+            paint.put_sprite(
+                canvas, note, (self._camera.width - note.width) // 2, self._bottom - note.height - self._margin_px
+            )
 
     def _kept_sprite(self, text: LabelText) -> LabelSprite:
         """Sprite of a label, looked up only when its text has changed."""

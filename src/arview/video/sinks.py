@@ -27,8 +27,6 @@ from arview.errors import OutputError
 from arview.video.frame import Image
 from arview.video.source import FrameSource
 
-PICTURES = (".jpg", ".jpeg", ".png")
-"""Endings of the names of annotated pictures."""
 CONTAINERS = {".mp4": "mp4", ".m4v": "mp4", ".mov": "mov"}
 """Container format by file suffix."""
 TICKS_PER_S = 90_000
@@ -57,7 +55,7 @@ class PictureSink:
     frames_written = 0
 
     def __init__(self, path: str | Path) -> None:
-        """A file that ends in one of `PICTURES`; see `VideoSink`."""
+        """A file whose name is that of a picture; see `VideoSink`."""
         self.path = Path(path)
 
     def write(self, image: Image, time_s: float) -> None:
@@ -336,5 +334,5 @@ def open_sink(path: str | Path, source: FrameSource) -> VideoSink | PictureSink:
     Raises:
         OutputError: see `VideoSink`.
     """
-    is_picture = source.frame_count == 1 and Path(path).suffix.lower() in PICTURES
+    is_picture = source.frame_count == 1 and Path(path).suffix.lower() in (".jpg", ".jpeg", ".png")
     return PictureSink(path) if is_picture else VideoSink(path, source.width, source.height, source.fps, source)

@@ -293,8 +293,7 @@ def _names(subject: _Subject, panel: Panel) -> list[str]:
             if low[0] < place[0] < high[0] and high[1] < place[1] < low[1] and not is_told:
                 continue
             weight = ' font-weight="600"' if is_told else ""
-            color = svg.INK if is_told else svg.MUTED
-            attributes = f'fill="{color}" text-anchor="middle"{weight}'
+            attributes = f'fill="{svg.INK if is_told else svg.MUTED}" text-anchor="middle"{weight}'
             half = 0.3 * 2.6 * panel.text * len(target.name)
             x = float(np.clip(place[0], panel.x + half, panel.x + panel.width - half))
             pieces.append(svg.haloed(x, place[1] + 0.9, target.name, 2.6 * panel.text, attributes))

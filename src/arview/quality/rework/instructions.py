@@ -339,8 +339,10 @@ def _place(standing: Standing, targets: Sequence[Target]) -> str:
             chosen.append(one)
             break
     parts = [sentence("rework.beside", reach=f"{reach:.0f}", name=name) for _, name, _, reach in chosen]
-    on = [sentence("rework.on", seat=standing.seat)] if standing.seat else []
-    told = [*on, *([_joined("rework.and", parts)] if parts else [])]
+    told = [
+        *([sentence("rework.on", seat=standing.seat)] if standing.seat else []),
+        *([_joined("rework.and", parts)] if parts else []),
+    ]
     return _joined("rework.place", told) if told else sentence("rework.as_drawn")
 
 

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-MOVE_STEP = "rework.step_move"
 STEPS: dict[str, tuple[str, ...]] = {
-    "adjust": ("rework.adjust_1", MOVE_STEP, "rework.adjust_2"),
-    "unbolt": ("rework.unbolt_1", MOVE_STEP, "rework.unbolt_2"),
-    "reweld": ("rework.reweld_1", "rework.reweld_2", MOVE_STEP, "rework.reweld_3", "rework.reweld_4"),
-    "reglue": ("rework.reglue_1", MOVE_STEP, "rework.reglue_2"),
-    "shim": ("rework.shim_1", MOVE_STEP, "rework.shim_2"),
+    "adjust": ("rework.adjust_1", "rework.step_move", "rework.adjust_2"),
+    "unbolt": ("rework.unbolt_1", "rework.step_move", "rework.unbolt_2"),
+    "reweld": ("rework.reweld_1", "rework.reweld_2", "rework.step_move", "rework.reweld_3", "rework.reweld_4"),
+    "reglue": ("rework.reglue_1", "rework.step_move", "rework.reglue_2"),
+    "shim": ("rework.shim_1", "rework.step_move", "rework.shim_2"),
     "bend": ("rework.bend_1", "rework.bend_2"),
     "replace": ("rework.replace_1", "rework.replace_2", "rework.replace_3"),
 }

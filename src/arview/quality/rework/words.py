@@ -160,8 +160,10 @@ def lateral_directions(
         slope = float(np.rad2deg(np.arccos(np.clip(np.linalg.norm(rise), 0.0, 1.0))))
         where = "" if slope < MAX_ANGLE_DEG else "_slope"
         rise = rise / np.linalg.norm(rise)
-        found += [NamedDirection(rise, sentence(f"rework.up{where}"))]
-        found += [NamedDirection(-rise, sentence(f"rework.down{where}"))]
+        found += [
+            NamedDirection(rise, sentence(f"rework.up{where}")),
+            NamedDirection(-rise, sentence(f"rework.down{where}")),
+        ]
     for side, azimuth_deg in _SIDES:
         direction = across(part.effective_view_range.direction(azimuth_deg, 0.0), normal)
         if np.linalg.norm(direction) > 0.7:

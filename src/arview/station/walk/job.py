@@ -354,10 +354,8 @@ class JobFolder:
 
 def jobs_in(folder: str | Path) -> list[JobFolder]:
     """All jobs in a folder, oldest first, each followed by its re-checks; what is no job is skipped."""
-    found = []
-    for job in sorted(_jobs_below(Path(folder)), key=lambda one: (str(one.document["created"]), one.id)):
-        found += [job, *job.rechecks()]
-    return found
+    first = sorted(_jobs_below(Path(folder)), key=lambda one: (str(one.document["created"]), one.id))
+    return [one for job in first for one in (job, *job.rechecks())]
 
 
 def start_worker(job: JobFolder) -> subprocess.Popen[bytes]:

@@ -125,14 +125,17 @@ class JobBoard:
 
     def expected_s(self, job: walk.JobFolder) -> float | None:
         """Time from the end of the photos to the verdict, s, by the last jobs of this part; None without one."""
-        kind = job.document["model_hash"], job.components is None
         with self._lock:
-            alike = [
-                one for one in self._known.values() if (one.document["model_hash"], one.components is None) == kind
-            ]
-        states = [one.state() for one in alike[-KEPT_TIMES:]]
-        shares = [(one.seconds_after_last_photo or 0.0) / one.photos for one in states if one.photos]
-        return median(known) * len(job.photos()) if (known := [share for share in shares if share]) else None
+            known = list(self._known.values())
+        alike = [
+            one
+            for one in known
+            if one.document["model_hash"] == job.document["model_hash"]
+            and (one.components is None) is (job.components is None)
+        ]
+        states = (one.state() for one in alike[-KEPT_TIMES:])
+        shares = [seconds / one.photos for one in states if one.photos and (seconds := one.seconds_after_last_photo)]
+        return median(shares) * len(job.photos()) if shares else None
 
     def inspection(self, job: walk.JobFolder, model: Model | None = None) -> Inspection | None:
         """What was measured of a job, rough or final; None while nothing was, or where it cannot be read."""

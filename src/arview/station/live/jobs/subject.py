@@ -88,7 +88,11 @@ class JobSubject(Subject):
         model = self.part.model
         own = self._board.inspection(self.job, model)
         if own is not None and is_open(state):
-            own = replace(own, components=tuple(_provisional(one) for one in own.components if _has_number(one)))
+            own = replace(
+                own,
+                components=tuple(_provisional(one) for one in own.components if _has_number(one)),
+                provenance=replace(own.provenance, note=sentence("told.inspection_rough")),
+            )
         first = self.job.parent
         if first is None and is_open(state):
             return own

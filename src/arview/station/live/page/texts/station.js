@@ -265,6 +265,7 @@ const de = {
   "walk.provisional": "{count} Fotos; vorläufige Werte aus {placed}",
   "walk.measuring": "Messung läuft",
   "walk.first": "die erste Messung wird gelesen",
+  "walk.checked_again": "{names} noch einmal geprüft {time}",
   "code.inspection_model": "die geänderte Prüfung gehört zu einem anderen Modell; gezeigt wird die letzte gültige",
   "code.inspection_unreadable": "die geänderte Prüfung ist nicht lesbar; gezeigt wird die letzte gültige",
   "code.inspection_future": "die Prüfung liegt in der Zukunft: eine Uhr geht falsch",
