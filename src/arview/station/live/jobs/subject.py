@@ -116,8 +116,10 @@ def is_open(state: walk.WalkState) -> bool:
 
 
 def _provisional(component: ComponentDeviation) -> ComponentDeviation:
-    """A component whose number is still to change: measured, without a verdict."""
-    return component if component.distance_mm is None else replace(component, verdict=Verdict.MEASURED)
+    """A component whose number is still to change: measured, not yet compared with its tolerance."""
+    return (
+        component if component.distance_mm is None else replace(component, verdict=Verdict.MEASURED, tolerance_mm=None)
+    )
 
 
 def _has_number(component: ComponentDeviation) -> bool:
