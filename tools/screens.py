@@ -34,6 +34,7 @@ from arview.quality.rework import drawing_svg, instruction_document, make_instru
 from arview.station.capture import words
 from arview.station.live.jobs.documents import inspection_document
 from arview.station.live.server import clients
+from arview.station.live.stream import documents
 from helpers import live_browser
 from helpers.live_client import Running
 from helpers.live_sample import INSPECTION, PART
@@ -231,12 +232,12 @@ def measured_job() -> dict[str, Any]:
     """What a station says of the sample's measurement, with instructions and drawings as it makes them."""
     part, inspection = sample()
     told = make_instructions(part, inspection)
-    documents = [instruction_document(one) for one in told]
+    instructions = [instruction_document(one) for one in told]
     drawings = {one.component: drawing_svg(part, inspection, one.component, "screen").encode() for one in told}
     return {
         "inspection": inspection_document(inspection),
-        "rework": documents,
-        "messages": with_messages({"rework": documents})["messages"],
+        "rework": instructions,
+        "messages": with_messages({"rework": instructions})["messages"],
         "drawings": drawings,
     }
 
@@ -451,8 +452,12 @@ ADVICE: dict[str, Any] = {}
 
 def patch_poses() -> None:
     """Let the poses of the station, which runs in this process, say `ADVICE`."""
-    plain = clients.pose_document
-    clients.pose_document = lambda *of, **more: {**plain(*of, **more), **({"capture": dict(ADVICE)} if ADVICE else {})}
+    plain = documents.pose_document
+
+    def told(*of: Any, **more: Any) -> dict[str, Any]:
+        return {**plain(*of, **more), **({"capture": dict(ADVICE)} if ADVICE else {})}
+
+    vars(clients)["pose_document"] = told
 
 
 def photograph(chromium: Any, server: Running, shot: Shot, path: Path) -> list[str]:
