@@ -9,7 +9,7 @@ import { t } from "../texts/texts.js";
 
 const MAX_LABELS = 12;
 const NARROW_PX = 560, MAX_NARROW_LABELS = 4; // on a phone in portrait more labels would hide the part
-const MAX_NARROW_SHARE = 0.15; // of the picture in view that labels cover there
+const MAX_NARROW_SHARE = 0.25; // of the picture in view that labels cover there
 const MAX_HIDDEN = 0.06; // share of the visible cells of failed components that a label may cover
 const LABEL_ROOM_PX = 55; // height of the area for each label
 const MIN_ROOM_PX = 200; // in a lower area only an isolated component has a label
@@ -146,6 +146,7 @@ export class Labels {
     }
     const maxLabels = isCramped ? 0 : isNarrow ? MAX_NARROW_LABELS : Math.min(MAX_LABELS, Math.floor(area.height / LABEL_ROOM_PX));
     const requests = [], signs = new Map(), roomPx = isNarrow ? MAX_NARROW_SHARE * (picture.right - picture.left) * (picture.bottom - picture.top) : Infinity;
+    const away = new Set(); // out of view: without its label nothing would say so
     let usedPx = 0;
     for (const label of this.#labels.values()) label.pointer.setAttribute("visibility", "hidden");
     for (const component of labels ? wanted : []) {
@@ -154,16 +155,17 @@ export class Labels {
       if (outside) anchor = this.#pointOut(label, anchor, picture);
       this.#pointHere(label, component, outside, toScreen);
       if (!anchor || !isInside(anchor, picture) || !this.#isLabelled(component)) continue;
-      if (!outside) signs.set(component.index, anchor);
+      if (outside) away.add(component.index);
+      else signs.set(component.index, anchor);
       if (requests.length === maxLabels) continue;
       if (!label.width) [label.width, label.height] = [label.element.offsetWidth, label.element.offsetHeight];
+      if (usedPx + label.width * label.height > roomPx && !only) continue; // its sign stays
       usedPx += label.width * label.height;
-      if (usedPx > roomPx && !only) continue; // its sign stays
       requests.push({ key: component.index, width: label.width, height: label.height, x: anchor[0], y: anchor[1] });
     }
     const covered = (left, top, width, height) => this.#covered(place, left, top, width, height);
     const laid = this.#layout.place(area, requests, this.#extent(place, requests), covered, glides);
-    const placed = laid.filter(({ key, left, top }) => this.#hiddenBy(place, left, top, this.#labels.get(key)) <= MAX_HIDDEN);
+    const placed = laid.filter(({ key, left, top }) => away.has(key) || this.#hiddenBy(place, left, top, this.#labels.get(key)) <= MAX_HIDDEN);
     const anchors = new Map(requests.map((one) => [one.key, one]));
     const names = new Set(placed.map((one) => one.key));
     const boxes = placed.map(({ key, left, top }) => grown(left, top, this.#labels.get(key)));
