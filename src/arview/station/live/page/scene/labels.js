@@ -9,7 +9,7 @@ import { t } from "../texts/texts.js";
 
 const MAX_LABELS = 12;
 const NARROW_PX = 560, MAX_NARROW_LABELS = 4; // on a phone in portrait more labels would hide the part
-const MAX_NARROW_SHARE = 0.25; // of the picture in view that labels cover there
+const MAX_NARROW_SHARE = 0.25; // of the area for labels, which is hardly more than the picture while a panel is open
 const MAX_HIDDEN = 0.06; // share of the visible cells of failed components that a label may cover
 const LABEL_ROOM_PX = 55; // height of the area for each label
 const MIN_ROOM_PX = 200; // in a lower area only an isolated component has a label
@@ -145,7 +145,7 @@ export class Labels {
       this.remeasure();
     }
     const maxLabels = isCramped ? 0 : isNarrow ? MAX_NARROW_LABELS : Math.min(MAX_LABELS, Math.floor(area.height / LABEL_ROOM_PX));
-    const requests = [], signs = new Map(), roomPx = isNarrow ? MAX_NARROW_SHARE * (picture.right - picture.left) * (picture.bottom - picture.top) : Infinity;
+    const requests = [], signs = new Map(), roomPx = isNarrow ? MAX_NARROW_SHARE * area.width * area.height : Infinity;
     const away = new Set(); // out of view: without its label nothing would say so
     let usedPx = 0;
     for (const label of this.#labels.values()) label.pointer.setAttribute("visibility", "hidden");
