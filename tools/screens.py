@@ -15,8 +15,9 @@ import json
 import sys
 import tempfile
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -25,12 +26,20 @@ from PIL import Image, ImageDraw, ImageFont
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
+from arview.cad import load_part
+from arview.core.messages import sentence, with_messages
+from arview.inspection import load_inspection
 from arview.pose import ComponentPresence, Identity, Presence, TrackingState, Visibility
+from arview.quality.rework import drawing_svg, instruction_document, make_instructions
+from arview.station.capture import words
+from arview.station.live.jobs.documents import inspection_document
+from arview.station.live.server import clients
+from arview.station.live.stream import documents
 from helpers import live_browser
 from helpers.live_client import Running
-from helpers.live_sample import INSPECTION
+from helpers.live_sample import INSPECTION, PART
 from helpers.page import changed, until
-from helpers.told_jobs import ToldJobs
+from helpers.told_jobs import CELLS, ToldJobs
 from helpers.told_session import TOLD
 from helpers.told_station import told_station
 
@@ -40,6 +49,9 @@ FILM_SIZE = 1280, 720
 TILE_PX, COLUMNS, ROWS, CAPTION_PX = 330, 5, 2, 22
 TRACKED = "document.body.dataset.state === 'tracked'"
 LABELLED = f"{TRACKED} && document.querySelectorAll('#labels .label:not(.off)').length > 0"
+
+PLATE = Path(__file__).resolve().parents[1] / "samples" / "plate"
+SIDES = tuple(sentence(f"capture.{side}") for side in ("right", "below", "left"))
 
 NO_WEBRTC = "delete globalThis.RTCPeerConnection"
 SERIAL = "void import('/static/serial.js').then((one) => one.askSerial({ frame: () => null, seen: () => 'BP-0417' }))"
@@ -60,6 +72,7 @@ class Shot:
         ready: expression that is true once the state is reached.
         after: what is done then.
         settings: of the browser's context, such as its locale.
+        advice: what the poses say of the capture; empty: nothing.
     """
 
     name: str
@@ -69,6 +82,7 @@ class Shot:
     ready: str = LABELLED
     after: Act = lambda page: None
     settings: dict[str, Any] = field(default_factory=dict)
+    advice: dict[str, Any] = field(default_factory=dict)
 
 
 def answers(path: str, document: Any, status: int = 200) -> Act:
@@ -208,6 +222,121 @@ def component_of_job(*then: Act) -> Act:
     return both(opened, lambda page: page.wait_for_selector(row), click(row), evaluate(shown), *then)
 
 
+def sample() -> tuple[Any, Any]:
+    """The sample part and its inspection, of which a component fails by a skewed move."""
+    return load_part(PART), load_inspection(INSPECTION)
+
+
+@cache
+def measured_job() -> dict[str, Any]:
+    """What a station says of the sample's measurement, with instructions and drawings as it makes them."""
+    part, inspection = sample()
+    told = make_instructions(part, inspection)
+    instructions = [instruction_document(one) for one in told]
+    drawings = {one.component: drawing_svg(part, inspection, one.component, "screen").encode() for one in told}
+    return {
+        "inspection": inspection_document(inspection),
+        "rework": instructions,
+        "messages": with_messages({"rework": instructions})["messages"],
+        "drawings": drawings,
+    }
+
+
+def worker_job(stage: str, is_recheck: bool = False) -> Act:
+    """A job in a stage: collecting, measuring, done; or the check of the failing component after its rework."""
+
+    def act(page: Any) -> None:
+        known = measured_job()
+        jobs = ToldJobs(drawings=known["drawings"])
+        photos = [f"{number:04d}.jpg" for number in range(1, 13)]
+        jobs.stored += [path.read_bytes() for path in sorted((PLATE / "photos").glob("*.jpg"))[:12]]
+        name = known["rework"][0]["component"]
+        job = jobs.add("j1", serial="BP-0417", photos=photos, messages=known["messages"])
+        state = {"stage": stage, "photos": 12, "cloud": "done", "is_rough": stage == "collecting"}
+        job["state"] = {
+            **job["state"],
+            **state,
+            "step": "adjusting" if stage == "measuring" else "",
+            "done": 1,
+            "total": 3,
+        }
+        job.update(inspection=known["inspection"])
+        if stage == "measuring":
+            job.update(is_ended=True, measuring_s=95.0, expected_s=210.0)
+        if stage == "done":
+            job.update(is_ended=True, rework=known["rework"])
+        if is_recheck:
+            checked = {**known["inspection"], "verdict": "not_measured"}
+            row = {"name": name, "before_mm": 2.99, "after_mm": 0.31, "verdict_before": "fail", "verdict_after": "pass"}
+            again = jobs.add(
+                "j1r", parent="j1", components=[name], serial="BP-0417", photos=photos[:5], before_after=[row]
+            )
+            again.update(inspection=checked, is_ended=True, state={**job["state"], "stage": "done"})
+        jobs.attach(page)
+        page.add_init_script(f"localStorage.setItem('arview-job', '{'j1r' if is_recheck else 'j1'}')")
+
+    return act
+
+
+def worker_shots() -> list[Shot]:
+    """What a worker sees of one inspection, in all sizes and both languages."""
+    advice = {
+        "job": "j1", "take_id": 0, "takes": False, "progress": 0.57, "is_enough": False, "distance": "good",
+        "text": str(words.more_message(9, [SIDES[0]] * 4 + [SIDES[1]] * 2 + [SIDES[2]] * 3)),
+        "reason": str(sentence("capture.hold_still")), "cells": "1" * 8 + "2" * 9 + "0" * (len(CELLS) - 17),
+        "components": [{"index": k, "photos": 2 + k, "U_mm": 0.1, "is_enough": k > 3, "text": ""} for k in range(11)],
+    }  # fmt: skip
+    advice["messages"] = {
+        **with_messages({"text": words.more_message(9, [SIDES[0]] * 4 + [SIDES[1]] * 2 + [SIDES[2]] * 3)})["messages"],
+        **with_messages({"reason": sentence("capture.hold_still")})["messages"],
+    }
+    enough = {**advice, "is_enough": True, "progress": 1.0, "text": str(sentence("capture.enough")),
+              "messages": with_messages({"text": sentence("capture.enough")})["messages"]}  # fmt: skip
+    hud, side = "!document.querySelector('#job-hud').hidden", "document.querySelector('#job .{}') !== null"
+    inspect = evaluate("document.body.dataset.side !== 'job' && document.querySelector('#open-job').click()")
+    component = measured_job()["rework"][0]["component"]
+    row = f'#job .component[data-name="{component}"]'
+    to_row = both(
+        inspect, lambda page: page.wait_for_selector(row), click(row), lambda page: page.wait_for_timeout(1500)
+    )
+    scroll = "document.querySelector('#job .{}')?.scrollIntoView({{ block: 'start' }})"
+    lost = {"feed": {"kind": "station", "state": "reconnecting", "text": "camera 0: cannot be opened; trying again",
+                     "age_ms": None, "received_fps": 0, "tracked_fps": 0, "received": 0, "dropped": 0, "unreadable": 0,
+                     "width": None, "height": None}}  # fmt: skip
+    states = {
+        "worker start": Shot("", before=files(), ready="true", after=inspect),
+        "worker capture": Shot("", before=worker_job("collecting"), ready=hud, advice=advice),
+        "worker enough": Shot("", before=worker_job("collecting"), ready=hud, advice=enough),
+        "worker undo": Shot("", before=worker_job("collecting"), ready=hud, advice=advice,
+                            after=click("#job-hud .undo")),
+        "worker measuring": Shot("", before=worker_job("measuring"), ready=side.format("job-progress"), after=inspect),
+        "worker cancel": Shot("", before=worker_job("measuring"), ready=side.format("job-progress"),
+                              after=both(inspect, click("#job .job-progress .wide"))),
+        "worker verdict": Shot("", before=worker_job("done"), ready=side.format("job-banner"), after=inspect),
+        "worker component": Shot("", before=worker_job("done"), ready=side.format("job-banner"), after=to_row),
+        "worker steps": Shot("", before=worker_job("done"), ready=side.format("job-banner"),
+                             after=both(to_row, evaluate(scroll.format("job-steps")))),
+        "worker drawing": Shot("", before=worker_job("done"), ready=side.format("job-banner"),
+                               after=both(to_row, evaluate(scroll.format("job-figure")))),
+        "worker recheck": Shot("", before=worker_job("done", True), ready=side.format("before-after"), after=inspect),
+        "worker parts": Shot("", after=evaluate("document.querySelector('#open-parts').click()")),
+        "worker view": Shot("", after=evaluate("document.querySelector('#open-view').click()")),
+        "worker no camera": Shot("", before=both(
+            script(NO_WEBRTC), changed("/status", lambda status: status.update(lost)),
+            changed("/control", lambda status: status.update(lost)),
+            lambda page: page.route("**/frame?*", lambda route: route.fulfill(status=204))),
+            ready="document.body.dataset.state !== undefined",
+            after=lambda page: page.wait_for_timeout(2500)),
+        "worker phone": Shot("", before=refused("NotAllowedError"), ready="!document.querySelector('#message').hidden"),
+    }  # fmt: skip
+    return [
+        replace(shot, name=f"{name}, {width}, {locale[:2]}", size=(width, height), settings={"locale": locale})
+        for name, shot in states.items()
+        for width, height in (SMALL, PHONE, LANDSCAPE, DESK)
+        for locale in ("de-DE", "en-US")
+    ]
+
+
 def in_the_future(part: dict[str, Any]) -> None:
     made = datetime.now(UTC) + timedelta(days=2)
     part["inspection"] |= {"created": made.isoformat().replace("+00:00", "Z"), "age_s": -172_800}
@@ -317,9 +446,24 @@ def shots() -> list[Shot]:
     ]  # fmt: skip
 
 
+ADVICE: dict[str, Any] = {}
+"""What every pose says of the capture."""
+
+
+def patch_poses() -> None:
+    """Let the poses of the station, which runs in this process, say `ADVICE`."""
+    plain = documents.pose_document
+
+    def told(*of: Any, **more: Any) -> dict[str, Any]:
+        return {**plain(*of, **more), **({"capture": dict(ADVICE)} if ADVICE else {})}
+
+    vars(clients)["pose_document"] = told
+
+
 def photograph(chromium: Any, server: Running, shot: Shot, path: Path) -> list[str]:
     """Photograph a state; returns the errors that the page reported."""
     TOLD.update({"components": {}, "more": {}, **shot.told})
+    ADVICE.update(shot.advice)
     width, height = shot.size
     given = {"locale": "en-US", "color_scheme": "dark", **shot.settings}
     context = chromium.new_context(viewport={"width": width, "height": height}, device_scale_factor=1, **given)
@@ -338,6 +482,7 @@ def photograph(chromium: Any, server: Running, shot: Shot, path: Path) -> list[s
         page.unroute_all(behavior="ignoreErrors")
         context.close()
         TOLD.update({"components": {}, "more": {}})
+        ADVICE.clear()
     return errors
 
 
@@ -364,7 +509,10 @@ def main() -> int:
     parser.add_argument("--only", nargs="*", default=[], metavar="WORD", help="states with one of these words")
     parser.add_argument("-o", "--output", type=Path, default=Path("out/screens"), help="folder of the pictures")
     chosen = parser.parse_args()
-    wanted = [one for one in shots() if not chosen.only or any(word in one.name for word in chosen.only)]
+    patch_poses()
+    wanted = [
+        one for one in (*shots(), *worker_shots()) if not chosen.only or any(word in one.name for word in chosen.only)
+    ]
     chosen.output.mkdir(parents=True, exist_ok=True)
     pictures, failures = [], 0
     with (

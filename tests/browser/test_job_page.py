@@ -173,7 +173,7 @@ def test_a_photo_is_taken_by_itself_once_for_each_number(chromium: Any, server: 
             until(page, lambda number=number: len(jobs.stored) == number)
             page.wait_for_timeout(1200)
             assert len(jobs.stored) == number
-        assert page.inner_text(".hud-count").startswith("2 of 20")
+        assert page.inner_text(".hud-count") == "2 photos"
     for about in jobs.begun.values():
         assert about["source"] == "still" and about["media_type"] == "image/jpeg"
         assert len(about["hint"]["cam_from_model"]) == 16 and about["hint"]["camera"]["width"] == WIDTH
@@ -185,7 +185,7 @@ def test_result_comes_without_a_reload_and_is_signed(chromium: Any, server: Runn
         page.click("#job-hud .shutter")
         page.click("#job-hud .hud-done")
         until(page, lambda: ("end", {}) in jobs.said and len(jobs.stored) == 1)
-        until(page, lambda: "placing photos" in page.inner_text("#job"))
+        until(page, lambda: "Measuring: 1 photo" in page.inner_text("#job"))
         found = {
             "verdict": "fail",
             "sentence": "1 of 11 is out of tolerance",
@@ -229,6 +229,45 @@ def test_result_comes_without_a_reload_and_is_signed(chromium: Any, server: Runn
     assert said["decisions"] == {**decision, "note": "bent in transport"}
     assert said["ticks"] == {"component": "post_1", "step": 1, "is_done": True, "by": "M. Lang"}
     assert said["sign"] == {"by": "M. Lang", "note": ""}
+
+
+def test_a_photo_is_taken_back_and_a_measurement_cancelled(chromium: Any, server: Running, jobs: ToldJobs) -> None:
+    advise(text=str(words.more_message(9, [])))
+    with opened(chromium, server, WATCH, PHONE, QUICK) as page:
+        job = capture(page, jobs)
+        for count in (1, 2):
+            page.click("#job-hud .shutter")
+            until(page, lambda count=count: len(jobs.stored) == count)
+        until(page, lambda: page.inner_text(".hud-count") == "2 photos")
+        until(page, "document.querySelectorAll('#job-hud .thumb img').length === 2")
+        page.click("#job-hud .undo")
+        assert "Photo 2" in page.inner_text("dialog")
+        page.get_by_role("button", name="It was blurred: take it again").click()
+        until(page, lambda: page.inner_text(".hud-count") == "1 photo")
+        assert job["photos"] == ["0001.jpg"] and ("photos/0002.jpg", {"why": "blurred"}) in jobs.said
+        jobs.is_gone = True  # one that has not arrived is taken back, too
+        page.click("#job-hud .shutter")
+        until(page, lambda: page.inner_text(".hud-count") == "2 photos")
+        page.click("#job-hud .undo")
+        page.get_by_role("button", name="Take this photo back").click()
+        until(page, lambda: page.inner_text(".hud-count") == "1 photo")
+        jobs.is_gone = False
+        page.wait_for_timeout(1500)
+        assert job["photos"] == ["0001.jpg"], "what was taken back on its way is not counted"
+
+        page.click("#job-hud .hud-done")
+        until(page, lambda: "Measuring: 1 photo" in page.inner_text("#job") and "min left" in page.inner_text("#job"))
+        job.update(inspection={"verdict": "fail", "sentence": "", "components": components(), "created": ""})
+        until(page, lambda: page.locator("#job .component").count() > 5)
+        shown = page.locator("#job .job-view")
+        assert shown.locator(".pass, .fail, .undecided").count() == 0, "nothing is judged yet"
+        page.get_by_role("button", name="Cancel").click()
+        page.get_by_role("button", name="Go on measuring").click()
+        assert ("reopen", {}) not in jobs.said
+        page.get_by_role("button", name="Cancel").click()
+        page.get_by_role("button", name="Yes, cancel").click()
+        until(page, lambda: page.locator("#job-hud").is_visible() and ("reopen", {}) in jobs.said)
+        assert page.inner_text(".hud-count") == "1 photo"
 
 
 def test_a_photo_is_taken_for_a_decision(chromium: Any, server: Running, jobs: ToldJobs) -> None:

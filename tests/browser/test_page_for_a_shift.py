@@ -125,7 +125,7 @@ def test_every_control_has_a_name_and_german_is_complete(chromium: Any, station:
                 until(page, "document.querySelector('dialog[open]') !== null")
                 assert all(name for _, name in controls(page, least=3))
     assert {"Freeze", "Snapshot", "Zoom in"} <= names["en"]["picture"]
-    assert {"Anhalten", "Foto", "Vergrößern"} <= names["de"]["picture"]
+    assert {"Anhalten", "Bild", "Vergrößern"} <= names["de"]["picture"]
     for section in ("picture", "view", "files", "devices"):
         words = {name for name in names["en"][section] if re.search(r"[a-z]{3}", name)}
         same = {one for one in words & names["de"][section] if "_" not in one}  # names of components

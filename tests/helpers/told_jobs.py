@@ -33,6 +33,7 @@ class ToldJobs:
         attached: content of those that were taken for decisions.
         uploads: content so far by the name of an upload.
         refusals: the next answers to pieces: status and document; an empty list answers as a station does.
+        drawings: of components, by name; another one without.
         lost: number of the next pieces that arrive while their answers do not.
         is_gone: no request is answered.
     """
@@ -44,6 +45,7 @@ class ToldJobs:
     begun: dict[str, dict[str, Any]] = field(default_factory=dict)
     refusals: list[tuple[int, dict[str, Any]]] = field(default_factory=list)
     said: list[tuple[str, dict[str, Any]]] = field(default_factory=list)
+    drawings: dict[str, bytes] = field(default_factory=dict)
     lost: int = 0
     is_gone: bool = False
 
@@ -57,7 +59,9 @@ class ToldJobs:
         job: dict[str, Any] = {
             "id": name, "part": "bracket_plate/part.toml", "part_name": "bracket_plate", "serial": "BP-1",
             "created": "2026-11-27T06:12:00Z", "parent": None, "photos": [], "attachments": [], "inspection": None,
-            "rework": [], "decisions": [], "signed": None, "rechecks": [], "before_after": [], "components": None,
+            "rework": [], "decisions": [], "signed": None,
+            "is_ended": False, "measuring_s": None, "expected_s": None,
+            "rechecks": [], "before_after": [], "components": None,
             "state": {"stage": "collecting", "text": "", "photos": 0, "placed": 0, "step": "", "done": 0, "total": 0,
                       "is_rough": False, "cloud": "waiting"},
         }  # fmt: skip
@@ -96,11 +100,21 @@ class ToldJobs:
                 return 200, self.attached[job["attachments"].index(rest.split("/", 1)[1])]
             if rest.startswith("photos/") and self.stored:
                 return 200, self.stored[job["photos"].index(rest.split("/")[1]) % len(self.stored)]
-            return (200, job) if not rest else (200, DRAWING) if rest.startswith("rework") else (404, {})
+            if rest.startswith("rework"):
+                return 200, self.drawings.get(rest.split("/")[1].removesuffix(".svg"), DRAWING)
+            return (200, job) if not rest else (404, {})
+        if method == "DELETE":
+            self.said.append((rest, {"why": url.rsplit("why=", 1)[1]}))
+            job["photos"].remove(rest.split("/")[1])
+            return 200, job
         said = json.loads(content or b"{}")
         self.said.append((rest, said))
         if rest == "end":
-            job["state"] = {**job["state"], "stage": "measuring", "text": "placing photos", "done": 3, "total": 12}
+            job["state"] = {**job["state"], "stage": "measuring", "step": "placing", "done": 3, "total": 12}
+            job.update(is_ended=True, measuring_s=40.0, expected_s=160.0)
+        elif rest == "reopen":
+            job["state"] = {**job["state"], "stage": "collecting", "step": ""}
+            job.update(is_ended=False, measuring_s=None)
         elif rest == "decisions":
             job["decisions"].append({**said, "time": "2026-11-27T06:20:00Z"})
         elif rest == "ticks":

@@ -12,6 +12,7 @@ import click
 
 from arview import guideviews, tracking, workflow
 from arview import overlay as overlays
+from arview.camera import PHOTO_SUFFIXES
 from arview.cli.common import (
     MODALITY,
     RENDERER,
@@ -191,7 +192,7 @@ def annotate(
     """Track the part in SOURCE (video, pictures, camera number, RTSP/HTTP address); write video and poses."""
     from arview.annotation import FollowingOverlay
     from arview.annotation import annotate as annotate_frames
-    from arview.video import VideoSink, open_source
+    from arview.video import open_sink, open_source
 
     check_profile(profile, camera_spec)
     if output is None and poses_path is None:
@@ -217,7 +218,7 @@ def annotate(
         _load_learned(session, outputs.learned)
         sink, overlay = None, None
         if outputs.video is not None:
-            sink = VideoSink(outputs.video, frames.width, frames.height, frames.fps, frames)
+            sink = open_sink(outputs.video, frames)
             overlay = FollowingOverlay(partial(workflow.make_overlay, specimens, drawing), session.camera_of)
         with progress_bar("frames", frames.frame_count) as progress:
             summary = annotate_frames(
@@ -362,9 +363,10 @@ def _print_summary(summary: AnnotateSummary, outputs: _Outputs, notes: Sequence[
 
 
 def _default_output(source: str) -> str:
-    """Name in the current folder for the annotated video of a source."""
+    """Name in the current folder for the annotated video of a source, or for the picture of one picture."""
     if source.isdecimal():
         return f"camera_{source}_annotated.mp4"
     name = Path(source if "://" not in source else source.split("://", 1)[1].rsplit("@", 1)[-1].split("?")[0])
     stem = "".join(letter for letter in name.stem if letter.isalnum() or letter in "-_. ")
-    return f"{stem.strip(' .') or 'video'}_annotated.mp4"
+    is_picture = name.suffix.lower() in PHOTO_SUFFIXES and not set("*?[%") & set(source)
+    return f"{stem.strip(' .') or 'video'}_annotated.{'jpg' if is_picture else 'mp4'}"

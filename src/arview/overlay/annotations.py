@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -15,6 +16,7 @@ from arview.overlay import paint
 from arview.overlay.label_sprite import LabelSprite, label_sprite
 from arview.overlay.labels import OCCLUDED, LabelText
 from arview.overlay.layout import LabelLayout, LabelRequest, PlacedLabel
+from arview.overlay.legend import banner_sprite
 from arview.overlay.options import Rgb
 
 _MIN_WIDEST = 14.0
@@ -66,10 +68,11 @@ class LaidOutLabel:
 
 @dataclass(frozen=True)
 class LaidOut:
-    """Labels and arrows of one picture."""
+    """Labels and arrows of one picture, and how many components have no label, by what theirs would say."""
 
     labels: tuple[LaidOutLabel, ...] = ()
     pointers: tuple[Pointer, ...] = ()
+    unlabelled: str = ""
 
 
 @dataclass(frozen=True)
@@ -167,7 +170,9 @@ class Annotations:
         labels = tuple(LaidOutLabel(sprite.text, sprite.lines, box) for sprite, box in drawn)
         shown = {label.box.key for label in labels}
         without = [one for one in components if one.text.is_urgent and one.text.name not in {*shown, *edges}]
-        return LaidOut(labels, (*edges.values(), *(self._pointer(one, placed) for one in without)))
+        others = Counter(one.text.word or one.text.value for one in components if one.text.name not in shown)
+        rest = ", ".join(f"{count} {word}" for word, count in sorted(others.items()))
+        return LaidOut(labels, (*edges.values(), *(self._pointer(one, placed) for one in without)), rest)
 
     def draw_leaders(self, canvas: paint.Image, wanted: WantedLabels | None, bottom_px: int) -> LaidOut:
         """Lay out the labels of a picture, and draw their leaders and arrows; `draw_labels` follows.
@@ -205,6 +210,11 @@ class Annotations:
         for label in laid_out.labels:
             sprite = self._shown[label.box.key][1].sprite
             paint.put_sprite(canvas, sprite, label.box.x, label.box.y, label.box.opacity)
+        if laid_out.unlabelled:
+            note = banner_sprite("", f"without a label: {laid_out.unlabelled}", self._size_px, self._camera.width)
+            paint.put_sprite(
+                canvas, note, (self._camera.width - note.width) // 2, self._bottom - note.height - self._margin_px
+            )
 
     def _kept_sprite(self, text: LabelText) -> LabelSprite:
         """Sprite of a label, looked up only when its text has changed."""

@@ -92,10 +92,10 @@ def _draw_swatch(sprite: paint.Sprite, kind: DrawnEvidence, x: int, y: int, widt
 
 @lru_cache(maxsize=16)
 def banner_sprite(title: str, text: str, size_px: int, width_px: int) -> paint.Sprite:
-    """Panel with a title and a text below it, broken between words; no word is left out."""
+    """Panel with a title, if any, and a text below it, broken between words; no word is left out."""
     pad = round(0.7 * size_px)
     room = width_px - 2 * pad
-    rows = [(paint.shortened(title, size_px, room, True), True)]
+    rows = [(paint.shortened(title, size_px, room, True), True)] if title else []
     line = ""
     for word in text.split():
         joined = f"{line} {word}".strip()
@@ -108,7 +108,8 @@ def banner_sprite(title: str, text: str, size_px: int, width_px: int) -> paint.S
     masks = [paint.text_mask(row, size_px, is_bold) for row, is_bold in rows]
     height = masks[0].shape[0]
     sprite = paint.panel(max(mask.shape[1] for mask in masks) + 2 * pad, len(masks) * height + pad, 0.4 * size_px, 0.85)
-    sprite.rgb[:, : max(3, pad // 3)] = _AMBER
+    if title:
+        sprite.rgb[:, : max(3, pad // 3)] = _AMBER
     for index, mask in enumerate(masks):
-        paint.write(sprite, mask, pad, pad // 2 + index * height, _AMBER if index == 0 else _WHITE)
+        paint.write(sprite, mask, pad, pad // 2 + index * height, _AMBER if rows[index][1] else _WHITE)
     return sprite

@@ -171,7 +171,7 @@ def _components(evidence: ReportEvidence) -> dict[str, Any]:
             axes.append(
                 {
                     "name": "xyz"[axis],
-                    "nominal": exact_number(nominal),
+                    "nominal": number(nominal, digits),
                     "measured": determined(None) if is_open else number(measured, digits),
                     "deviation": determined(None) if is_open else number(moved, digits, signed=True),
                 }

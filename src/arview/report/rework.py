@@ -32,20 +32,19 @@ def rework_context(evidence: ReportEvidence) -> dict[str, Any]:
     part = evidence.part
     if part is None:
         return {"rework": []}
-    rows = []
-    for one in make_instructions(part, evidence.inspection):
-        rows.append(
-            {
-                "name": one.component,
-                "how": _HOW.get(one.how, one.how),
-                "what": f"{one.what[:1].upper()}{one.what[1:]}.",
-                "text": one.text,
-                "steps": one.steps,
-                "remark": one.remark,
-                "drawing": Markup(drawing_svg(part, evidence.inspection, one.component)),
-                "pictures": [picture for name in one.pictures if (picture := _of_part(part, name)) is not None],
-            }
-        )
+    rows = [
+        {
+            "name": one.component,
+            "how": _HOW.get(one.how, one.how),
+            "what": "" if any(one.what.lower() in step.lower() for step in one.steps) else one.what,
+            "text": one.text,
+            "steps": one.steps,
+            "remark": one.remark,
+            "drawing": Markup(drawing_svg(part, evidence.inspection, one.component, "report")),
+            "pictures": [picture for name in one.pictures if (picture := _of_part(part, name)) is not None],
+        }
+        for one in make_instructions(part, evidence.inspection)
+    ]
     return {"rework": rows}
 
 

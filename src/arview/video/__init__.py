@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from arview.video.pictures import sorted_naturally as sorted_naturally
     from arview.video.sinks import CONTAINERS as CONTAINERS
     from arview.video.sinks import VideoSink as VideoSink
+    from arview.video.sinks import open_sink as open_sink
     from arview.video.source import FrameRange as FrameRange
     from arview.video.source import FrameSource as FrameSource
     from arview.video.sources import check_source as check_source
@@ -38,6 +39,7 @@ __getattr__, __dir__, __all__ = lazy_door(
         "sinks": (
             "CONTAINERS",
             "VideoSink",
+            "open_sink",
         ),
         "source": (
             "FrameRange",

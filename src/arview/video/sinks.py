@@ -21,7 +21,7 @@ from av.packet import Packet
 from av.video.reformatter import ColorPrimaries, ColorRange, Colorspace, ColorTrc
 from av.video.stream import VideoStream
 
-from arview.core.atomic import begin_unfinished
+from arview.core.atomic import begin_unfinished, write_file
 from arview.errors import OutputError
 from arview.video.frame import Image
 from arview.video.source import FrameSource
@@ -40,6 +40,33 @@ _FRAGMENTED = {"movflags": "+hybrid_fragmented", "frag_duration": "1000000", "fl
 """Fragments of a second, µs, until the file is finished; then it is made an ordinary one."""
 _AUDIO_LEAD_S = 0.05
 """Sound this long before the first frame is kept, because AAC starts with a silent packet."""
+
+
+class PictureSink:
+    """The annotated picture of a source that is one picture.
+
+    Attributes:
+        frames_written: 1 once there is one.
+        audio_note: empty, as there is no sound.
+    """
+
+    audio_note = ""
+    frames_written = 0
+
+    def __init__(self, path: str | Path) -> None:
+        """A file whose name is that of a picture; see `VideoSink`."""
+        self.path = Path(path)
+
+    def write(self, image: Image, time_s: float) -> None:
+        """Keep the frame (H,W,3) uint8 RGB."""
+        self._image, self.frames_written = image.copy(), 1
+
+    def close(self) -> None:
+        """Write the file. Raises OutputError."""
+        write_file(self.path, cv2.imencode(self.path.suffix, self._image[..., ::-1])[1].tobytes())
+
+    def abort(self) -> None:
+        """Nothing was written yet."""
 
 
 class VideoSink:
@@ -297,3 +324,13 @@ def _end_s(packet: Packet[AudioStream]) -> float:
     """End time of a sound packet, seconds."""
     assert packet.pts is not None and packet.time_base is not None
     return float((packet.pts + (packet.duration or 0)) * packet.time_base)
+
+
+def open_sink(path: str | Path, source: FrameSource) -> VideoSink | PictureSink:
+    """The file for the annotated frames of a source: a picture if it is one and the name is that of one, else a video.
+
+    Raises:
+        OutputError: see `VideoSink`.
+    """
+    is_picture = source.frame_count == 1 and Path(path).suffix.lower() in (".jpg", ".jpeg", ".png")
+    return PictureSink(path) if is_picture else VideoSink(path, source.width, source.height, source.fps, source)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from dataclasses import replace
 from xml.etree import ElementTree
@@ -105,7 +106,7 @@ def test_a_component_on_a_wall_is_seen_against_it() -> None:
 
 def test_names_that_are_told_are_shown() -> None:
     root = drawn(off(WALL, "block_1", (-2.0, 0.0, 0.0)))
-    assert "to east" in texts(root)  # outside of the window: an arrow at its edge
+    assert "east" in texts(root) and "to east" not in texts(root)  # outside of the window: named at its edge
 
 
 def test_nothing_is_said_by_colour_alone() -> None:
@@ -113,7 +114,7 @@ def test_nothing_is_said_by_colour_alone() -> None:
     plan = panels(root)[0]
     dashes = {one.get("stroke"): one.get("stroke-dasharray") for one in plan.iter(f"{NS}path")}
     assert dashes[DESIGN] is None and dashes[MEASURED]
-    for words in ("design place", "as measured", "tolerance zone, ± 0.5 mm", "U = 0.06 mm"):
+    for words in ("design place", "as measured", "tolerance zone, radius 0.5 mm", "U = 0.06 mm"):
         assert words in texts(root)
     assert "Rework of block_1: move 2.00" in root.get("aria-label", "")
 
@@ -169,3 +170,16 @@ def test_steps_of_scales_and_lines_of_texts() -> None:
     assert [nice(value) for value in (0.9, 1.0, 4.9, 50.0, 199.0, 0.024)] == [0.5, 1.0, 2.0, 50.0, 100.0, 0.02]
     lines = wrapped("one two three four five six seven", 20.0, 3.0)
     assert " ".join(lines) == "one two three four five six seven" and max(len(line) for line in lines) <= 11
+
+
+def test_on_a_screen_letters_are_large_and_what_is_shown_is_told_as_messages() -> None:
+    found = inspection(WALL.model, [off(WALL, "block_1", (-2.0, 0.0, 0.0))])
+    text = drawing_svg(WALL, found, "block_1", "screen")
+    root = ElementTree.fromstring(text)
+    width = float(root.get("viewBox", "").split()[2])
+    sizes = [float(one.get("font-size", "0")) for one in root.iter(f"{NS}text")]
+    assert sizes and min(sizes) * 336.0 / width >= 14.0  # px on a phone of 360 px
+    (about,) = root.iter(f"{NS}metadata")
+    told = json.loads(about.text or "")
+    assert told["messages"][told["text"]]["key"].startswith("rework.seen_") and told["tolerance"] == "0.5"
+    assert not any("design place" in one or "magnified" in one for one in texts(root))

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from arview.cad import Part, load_part
 from arview.cad.part import ReworkAxis, ReworkSettings
 from arview.cad.view_range import Up
+from arview.core.messages import with_messages
 from arview.errors import MismatchError
 from arview.geometry import Array, apply, exp_so3, rigid
 from arview.inspection import ComponentDeviation, Details, Verdict
@@ -287,3 +288,20 @@ def test_walls_and_slopes_of_a_real_part() -> None:
     plug = part.model.component("plug_1").centroid_in_model
     (one,) = told(part, deviation("plug_1", (0.0, 0.0, -0.9), plug))
     assert one.what.split(" mm ")[1] == "up"
+
+
+@pytest.mark.parametrize("angle_deg", range(0, 360, 15))
+def test_no_move_is_longer_than_the_displacement(angle_deg: int) -> None:
+    moved = (np.cos(np.deg2rad(angle_deg)), np.sin(np.deg2rad(angle_deg)), 0.0)
+    (one,) = told(WALL, off(WALL, "block_1", (float(moved[0]), float(moved[1]), 0.0)))
+    assert one.moves and max(move.distance_mm for move in one.moves) <= 1.0 + 1e-6
+    assert np.allclose(total(one), -np.array(moved), atol=0.3)
+
+
+def test_what_is_said_has_keys_for_the_language_of_a_page() -> None:
+    (one,) = told(WALL, off(WALL, "block_1", (0.8, -0.3, 0.9)))
+    messages = with_messages(instruction_document(one))["messages"]
+    assert {text for text in one.steps if text not in messages} == set()
+    assert all(move.text in messages for move in one.moves)
+    step = next(text for text in one.steps if one.moves[0].text.lower() in text.lower())
+    assert messages[step]["values"]["move"]["key"] in ("rework.move", "rework.then")

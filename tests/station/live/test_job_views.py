@@ -85,6 +85,7 @@ def test_drawn_labels_say_measuring_until_there_is_a_number(tmp_path: Path) -> N
     assert view.subject.reload()
     first = drawn_lines(view)
     assert first["post_1"][1].endswith(" mm") and "measuring" not in first["post_1"]
+    assert {"MEASURED"} == {first[name][2] for name in ("post_1", "post_2")}, "no verdict before the end"
     assert "measuring" in first["nut_1"] and first["nut_1"] == before["nut_1"]
     pictures.append(annotator.draw(view.shown(tracked(view.subjects))).image)
     # Of the only component that is drawn.

@@ -195,6 +195,19 @@ def test_the_end_of_a_walk_is_no_reason_to_measure_twice_and_a_late_photo_is(
     assert len(workers.started) == 3
 
 
+def test_a_measurement_is_stopped_and_begins_anew_when_asked(part: Part, tmp_path: Path, made: Any) -> None:
+    job = job_with_photos(part, tmp_path, "BP-1")
+    workers = made()
+    workers.queue.ask(job)
+    workers.queue.tick()
+    job.reopen()
+    workers.queue.stop(job)
+    assert workers.processes[job.id].poll() is not None, "it has ended when this returns"
+    workers.queue.ask(job)
+    workers.tick_until(lambda: len(workers.started) == 2)
+    assert workers.queue.state(job.id) == "running"
+
+
 def test_workers_end_with_the_server_also_those_that_do_not_listen(
     part: Part, tmp_path: Path, made: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -112,6 +112,35 @@ def test_photos_are_uploaded_in_pieces_and_asked_for_again(page: Http, folder: P
     assert not page.json("POST", f"/api/jobs/{job}/reopen")[1]["is_ended"]
 
 
+def test_a_photo_is_taken_back(page: Http, folder: Path) -> None:
+    job = started(page)
+    assert [send(page, job, photo(number)) for number in (1, 2)] == ["0001.jpg", "0002.jpg"]
+    status, left = page.json("DELETE", f"/api/jobs/{job}/photos/0001.jpg?why=blurred")
+    assert status == 200 and left["photos"] == ["0002.jpg"]
+    assert page.json("GET", f"/api/jobs/{job}")[1]["photos"] == ["0002.jpg"]
+    assert page.ask("GET", f"/api/jobs/{job}/photos/0001.jpg")[0] == 404
+    assert b'"why": "blurred"' in (on_disk(folder, job).path / "photos.jsonl").read_bytes()
+    assert page.json("DELETE", f"/api/jobs/{job}/photos/0001.jpg")[0] == 400
+    page.json("POST", f"/api/jobs/{job}/end")
+    assert page.json("DELETE", f"/api/jobs/{job}/photos/0002.jpg")[0] == 400
+
+
+def test_the_time_of_a_measurement_is_told_by_the_last_ones(page: Http, folder: Path) -> None:
+    first, second = started(page), started(page)
+    for job in (first, second):
+        send(page, job, photo(3, 90))
+    send(page, second, photo(4, 90))
+    done = on_disk(folder, first)
+    measured(done)
+    done.write_state(replace(done.state(), photos=1, seconds_after_last_photo=30.0))
+    page.json("GET", "/api/jobs")
+    page.json("POST", f"/api/jobs/{second}/end")
+    told = page.json("GET", f"/api/jobs/{second}")[1]
+    assert told["expected_s"] is not None and told["expected_s"] > 0.0 and 0.0 <= told["measuring_s"] < 60.0
+    reopened = page.json("POST", f"/api/jobs/{second}/reopen")[1]
+    assert reopened["measuring_s"] is None and reopened["state"]["stage"] == "collecting"
+
+
 def test_what_is_not_there_is_not_found(page: Http) -> None:
     job = started(page)
     for path in ("/api/jobs/nope", "/api/jobs/..%2f..", f"/api/jobs/{job}/photos/..%2fjob.json", f"/api/jobs/{job}/x",

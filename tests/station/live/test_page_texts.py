@@ -23,7 +23,8 @@ PROSE = re.compile(r"[A-Za-z]{2,}[,.:;]? [A-Za-z]{2,}|^[A-Z][a-z]{2,}$")
 """Two words in a row, or one with a capital letter."""
 TECHNICAL = re.compile(  # names, classes, queries, and words of the server that are compared
     r"^(?:[A-Z]\w*Error|Content-Type|Retry-After|X-Arview-Answer|Arrow\w+|Escape|Enter|Bad|GET|POST|PATCH|DELETE|"
-    r"(?:[\w-]+ )+|[a-z]+: [\w-]+|\(prefers-[\w-]+: \w+\)|NOT YET CHECKED|translate\(.*)$"
+    r"(?:[\w-]+ )+|[a-z]+: [\w-]+|\(prefers-[\w-]+: \w+\)|NOT YET CHECKED|translate\(.*|"
+    r"matching again|finding the part|reading photos|fitting the CAD)$"
 )
 SENTENCES = re.compile(r"^(?:" + "|".join({key.split(".")[0] for key in CATALOGUE}) + r")\.")
 """Keys of sentences of the station, which arrive in English."""

@@ -112,6 +112,28 @@ def test_a_walk_ends_and_is_reopened(part: Part, tmp_path: Path) -> None:
     assert len((job.path / "photos.jsonl").read_text().splitlines()) == 4
 
 
+def test_a_photo_is_taken_back_until_the_walk_ends(part: Part, tmp_path: Path) -> None:
+    job = new_job(part, tmp_path)
+    for number in (1, 2, 3):
+        add(job, number)
+    job.take_back("0002.jpg", "blurred")
+    again = JobFolder.open(job.path)
+    assert [photo.name for photo in again.photos()] == ["0001.jpg", "0003.jpg"] and again.faults() == ()
+    assert not (job.path / "photos" / "0002.jpg").exists()
+    assert (job.path / "taken_back" / "0002.jpg").read_bytes() == picture(2)
+    with pytest.raises(InputError, match="no photo that can be taken back"):
+        job.take_back("0002.jpg")
+    assert add(job, 2) == "0005.jpg"  # the same content once more is a photo of its own
+    job.remove_unconfirmed()
+    assert len(list((job.path / "photos").iterdir())) == len(job.photos()) == 3
+    job.end()
+    with pytest.raises(InputError, match="reopen"):
+        job.take_back("0001.jpg")
+    job.reopen()
+    job.take_back("0001.jpg")
+    assert [photo.name for photo in job.photos()] == ["0003.jpg", "0005.jpg"]
+
+
 def test_a_torn_line_is_set_aside_and_told(part: Part, tmp_path: Path) -> None:
     job = new_job(part, tmp_path)
     add(job, 1)

@@ -9,8 +9,9 @@ import numpy as np
 from arview import measurement
 from arview.cad import Model, Part
 from arview.core.fits import row_space
+from arview.core.messages import sentence
 from arview.geometry import Array, apply, log_so3
-from arview.inspection import MEASURANDS, ComponentDeviation
+from arview.inspection import ComponentDeviation
 from arview.quality.rework.words import up_of
 
 
@@ -21,7 +22,7 @@ class Standing:
     Attributes:
         component: its name.
         center_in_model: (3,) nominal position of the point whose displacement is stated, mm.
-        point: that point, in words.
+        point: that point, in words, a message.
         normal_in_model: (3,) unit vector away from what it stands on; up where it stands on nothing.
         seat: name of the component on which it stands; empty if it stands on none.
         axis_in_model: (3,) its own axis: tilt is that of this axis, twist the turn about it.
@@ -77,10 +78,10 @@ def standing_of(one: ComponentDeviation, part: Part) -> Standing:
     component = part.model.component(one.name)
     measurand = measurement.measurand_of(one.name, part)
     details = one.details
-    center, point = measurand.point_in_model, MEASURANDS[measurand.kind]
+    center, kind = measurand.point_in_model, measurand.kind
     axis, axis_from = measurand.axes[2], measurand.axis_from
     if details is not None:
-        center, point = np.array(details.center_mm), MEASURANDS[details.measurand]
+        center, kind = np.array(details.center_mm), details.measurand
         if details.axes is not None and details.axis_from is not None:
             axis, axis_from = np.array(details.axes)[2], details.axis_from
     seat = measurement.seat_of(component, part.model)
@@ -89,7 +90,7 @@ def standing_of(one: ComponentDeviation, part: Part) -> Standing:
     return Standing(
         component=one.name,
         center_in_model=center,
-        point=point,
+        point=sentence(f"point.{kind}"),
         normal_in_model=normal / np.linalg.norm(normal),
         seat="" if seat is None else _seat_name(one.name, part, seat.middle),
         axis_in_model=axis / np.linalg.norm(axis),
@@ -103,11 +104,9 @@ def _seat_name(name: str, part: Part, middle: Array) -> str:
     model, component = part.model, part.model.component(name)
     corners = component.vertices_in_model[component.faces]
     points = np.concatenate([corners.reshape(-1, 3), corners.mean(axis=1), middle[None]])
-    counts = {}
-    for other in model.components:
-        if other.name != name:
-            pair = Model(model.name, (component, other), model.source_hash)
-            counts[other.name] = int(measurement.near_others(points, pair, 0, 0.3).sum())
+    others = [one for one in model.components if one.name != name]
+    pairs = [Model(model.name, (component, one), model.source_hash) for one in others]
+    counts = {pair.components[1].name: int(measurement.near_others(points, pair, 0, 0.3).sum()) for pair in pairs}
     best = max(counts, key=lambda one: counts[one], default="")
     return best if best and counts[best] else ""
 

@@ -2,24 +2,35 @@
 
 from __future__ import annotations
 
+import json
+import re
 import zlib
 from dataclasses import dataclass, replace
 from html import escape
+from typing import Literal
 
 import numpy as np
 
 from arview.cad import Component, Part
+from arview.core.messages import sentence, with_messages
 from arview.errors import InputError
 from arview.geometry import Array, apply
 from arview.inspection import ComponentDeviation, Finding, Inspection, exact
 from arview.quality.rework import svg
 from arview.quality.rework.correction import Correction, Standing, correction_of, standing_of
 from arview.quality.rework.instructions import make_instructions
-from arview.quality.rework.outline import ParallelView, Window, visible_lines
+from arview.quality.rework.outline import ParallelView, visible_lines
+from arview.quality.rework.panel import Panel
 from arview.quality.rework.types import Instruction, ReworkMove
-from arview.quality.rework.words import across, targets_of, up_of
+from arview.quality.rework.words import across, seen_along, targets_of, up_of
 
+Form = Literal["sheet", "report", "screen"]
+"""A sheet says all there is to do; in a report text and legend stand beside the drawings; a screen is narrow, and has
+its own language."""
 WIDTH_MM = 180.0
+SCREEN_WIDTH_MM = 90.0
+SCREEN_TEXT = 1.5
+"""Width of the drawing on a screen, where the panels are below each other, and factor of its letters."""
 PLAN_WIDTH_MM = 110.0
 SIDE_WIDTH_MM = 64.0
 MIN_PLAN_HEIGHT_MM = 64.0
@@ -31,42 +42,6 @@ HEAD_MM = 8.0
 """Room for the name; the lines of the moves come on top."""
 MAX_MAGNIFICATION = 200.0
 """Largest factor by which moves are drawn longer than they are."""
-
-
-@dataclass(frozen=True)
-class _Panel:
-    """A rectangle of the sheet that shows a window of the drawing plane.
-
-    Attributes:
-        x, y, width, height: on the sheet, mm, from its upper left corner.
-        center: (2,) of the window in the drawing plane, mm.
-        scale: mm on the sheet for each mm of the part.
-    """
-
-    x: float
-    y: float
-    width: float
-    height: float
-    center: Array
-    scale: float
-
-    @property
-    def window(self) -> Window:
-        half = 0.5 / self.scale * np.array([self.width, self.height])
-        (left, low), (right, high) = self.center - half, self.center + half
-        return float(left), float(low), float(right), float(high)
-
-    def at(self, points: Array) -> Array:
-        """Points (...,2+) of the drawing plane on the sheet."""
-        middle = np.array([self.x + 0.5 * self.width, self.y + 0.5 * self.height])
-        return np.asarray((np.asarray(points)[..., :2] - self.center) * (self.scale, -self.scale) + middle)
-
-    def holds(self, place: Array, margin: float = 0.0) -> bool:
-        """Whether a place (2,) on the sheet is inside."""
-        inside = (place >= (self.x + margin, self.y + margin)) & (
-            place <= (self.x + self.width - margin, self.y + self.height - margin)
-        )
-        return bool(inside.all())
 
 
 @dataclass(frozen=True)
@@ -91,12 +66,13 @@ class _Subject:
         return self.view.to_plane(self.standing.center_in_model - self.correction.shift_mm)[:2]
 
 
-def drawing_svg(part: Part, inspection: Inspection, component: str) -> str:
+def drawing_svg(part: Part, inspection: Inspection, component: str, form: Form = "sheet") -> str:
     """The drawing of a component as SVG, in mm: printed at 100 % its plan has the scale that it states.
 
     It shows the design outline (solid), the measured one (dashed), what is beside them, and magnified the displacement
     of the point whose distance is stated, with its U and the tolerance zone. It is seen along the direction away from
-    the seat, or from the side where the component has to be moved along it.
+    the seat, or from the side where the component has to be moved along it. On a screen what it shows is told by its
+    ``metadata``: view, magnification, U, tolerance and point, as messages.
 
     Raises:
         InputError: the inspection or the part has no such component.
@@ -109,25 +85,34 @@ def drawing_svg(part: Part, inspection: Inspection, component: str) -> str:
     told = {one.component: one for one in make_instructions(part, inspection)}
     subject = _subject(part, deviation, told.get(component))
     low, high = _extent(subject)
+    is_screen = form == "screen"
+    width, plan_width = (SCREEN_WIDTH_MM, SCREEN_WIDTH_MM - 0.6) if is_screen else (WIDTH_MM, PLAN_WIDTH_MM)
     scale = min(
         1.0,
-        _scale_for(PLAN_WIDTH_MM, high[0] - low[0] + 2.0 * MARGIN_MM),
+        _scale_for(plan_width, high[0] - low[0] + 2.0 * MARGIN_MM),
         _scale_for(MAX_PLAN_HEIGHT_MM, high[1] - low[1] + 2.0 * MARGIN_MM),
     )
     height = float(np.clip((high[1] - low[1] + 2.0 * MARGIN_MM) * scale, MIN_PLAN_HEIGHT_MM, MAX_PLAN_HEIGHT_MM))
-    top, pieces = _head(subject, inspection)
-    plan = _Panel(0.3, top, PLAN_WIDTH_MM, height, 0.5 * (low + high), scale)
+    top, pieces = (0.3, []) if is_screen else _head(subject, inspection, form)
+    plan = Panel(0.3, top, plan_width, height, 0.5 * (low + high), scale, SCREEN_TEXT if is_screen else 1.0)
     key = f"r{zlib.crc32(f'{part.name}/{inspection.serial}/{component}'.encode()):08x}"
-    plan_bottom, drawn = _plan(subject, plan, f"{key}a")
-    side_bottom, side = _side(subject, WIDTH_MM - SIDE_WIDTH_MM - 0.3, top, f"{key}b")
+    plan_bottom, drawn = _plan(subject, plan, f"{key}a", form)
+    side_panel = (
+        _side_panel(subject, width - SIDE_WIDTH_MM - 0.3, top, SIDE_WIDTH_MM)
+        if not is_screen
+        else _side_panel(subject, 0.3, plan_bottom + 2.0, plan_width)
+    )
+    side_bottom, side = _side(subject, side_panel, f"{key}b", form)
     pieces += drawn + side
+    if is_screen:
+        pieces.append(f"<metadata>{escape(_about(subject, side_panel))}</metadata>")
     total = max(plan_bottom, side_bottom)
     what = subject.instruction.what if subject.instruction is not None else "nothing is asked for"
     label = escape(f"Rework of {component}: {what}. {subject.view.words}.", quote=True)
     return (
-        f'<svg xmlns="http://www.w3.org/2000/svg" width="{WIDTH_MM:g}mm" height="{total:.2f}mm" '
-        f'viewBox="0 0 {WIDTH_MM:g} {total:.2f}" font-family="{svg.FONT}" role="img" aria-label="{label}">'
-        f'<rect width="{WIDTH_MM:g}" height="{total:.2f}" fill="#fff"/>{"".join(pieces)}</svg>'
+        f'<svg xmlns="http://www.w3.org/2000/svg" width="{width:g}mm" height="{total:.2f}mm" '
+        f'viewBox="0 0 {width:g} {total:.2f}" font-family="{svg.FONT}" role="img" aria-label="{label}">'
+        f'<rect width="{width:g}" height="{total:.2f}" fill="#fff"/>{"".join(pieces)}</svg>'
     )
 
 
@@ -172,16 +157,13 @@ def view_of(part: Part, standing: Standing, correction: Correction) -> ParallelV
         if toward @ (front + 0.1 * up) < 0.0:
             toward = -toward
         right = np.cross(normal, toward)
-        where = f", {standing.seat} below" if standing.seat and normal @ up > 0.9 else ""
-        behind = f", {standing.seat} at the lower edge" if standing.seat and not where else ""
-        return ParallelView(
-            standing.center_in_model, np.stack([right, normal, toward]), f"seen from the side{where}{behind}"
-        )
+        where = "" if not standing.seat else "_below" if normal @ up > 0.9 else "_edge"
+        words = sentence(f"rework.seen_side{where}", seat=standing.seat)
+        return ParallelView(standing.center_in_model, np.stack([right, normal, toward]), words)
     rise = across(up, normal)
     upward = rise if np.linalg.norm(rise) > 0.3 else across(-front, normal)
     upward = upward / np.linalg.norm(upward)
-    words = "seen from above" if normal @ up > 0.9 else "seen from below" if normal @ up < -0.9 else ""
-    words = words or (f"seen with {standing.seat} behind it" if standing.seat else "seen from its free end")
+    words = seen_along(normal, standing.seat, up)
     return ParallelView(standing.center_in_model, np.stack([np.cross(upward, normal), upward, normal]), words)
 
 
@@ -203,11 +185,11 @@ def _scale_text(scale: float) -> str:
     return f"{scale:g} : 1" if scale > 1.0 else f"1 : {1.0 / scale:g}"
 
 
-def _head(subject: _Subject, inspection: Inspection) -> tuple[float, list[str]]:
-    """Where the panels begin, and what is above them: name, part and moves."""
+def _head(subject: _Subject, inspection: Inspection, form: Form) -> tuple[float, list[str]]:
+    """Where the panels begin, and what is above them: name, part and, on a sheet, moves."""
     told, name = subject.instruction, subject.deviation.name
     what = "nothing is asked for" if told is None else told.what
-    lines = svg.wrapped(f"{what[:1].upper()}{what[1:]}.", WIDTH_MM, 3.2)
+    lines = svg.wrapped(f"{what[:1].upper()}{what[1:]}.", WIDTH_MM, 3.2) if form == "sheet" else []
     title = f"{inspection.part} {inspection.serial}".strip()
     pieces = [
         svg.text(0.0, 4.4, name, 4.6, f'fill="{svg.INK}" font-weight="600"'),
@@ -217,7 +199,7 @@ def _head(subject: _Subject, inspection: Inspection) -> tuple[float, list[str]]:
     return HEAD_MM + 4.0 * len(lines), pieces
 
 
-def _framed(panel: _Panel, key: str, pieces: list[str]) -> list[str]:
+def _framed(panel: Panel, key: str, pieces: list[str]) -> list[str]:
     """Pieces that are cut at the edge of their panel, and its frame."""
     box = f'x="{panel.x:g}" y="{panel.y:g}" width="{panel.width:g}" height="{panel.height:g}"'
     return [
@@ -228,7 +210,7 @@ def _framed(panel: _Panel, key: str, pieces: list[str]) -> list[str]:
     ]
 
 
-def _outlines(subject: _Subject, panel: _Panel, with_others: bool) -> list[str]:
+def _outlines(subject: _Subject, panel: Panel, with_others: bool) -> list[str]:
     """Everything that a panel shows of the part: others thin, the design place solid, the measured one dashed."""
     view, window = subject.view, panel.window
     pieces = []
@@ -246,7 +228,7 @@ def _outlines(subject: _Subject, panel: _Panel, with_others: bool) -> list[str]:
     return pieces
 
 
-def _plan(subject: _Subject, panel: _Panel, key: str) -> tuple[float, list[str]]:
+def _plan(subject: _Subject, panel: Panel, key: str, form: Form) -> tuple[float, list[str]]:
     """Where the plan ends on the sheet, and its pieces: the component among its neighbours, scale and remark."""
     pieces = _outlines(subject, panel, with_others=True)
     pieces += _names(subject, panel)
@@ -256,25 +238,26 @@ def _plan(subject: _Subject, panel: _Panel, key: str) -> tuple[float, list[str]]
             pieces.append(svg.arrow(measured, design, 0.45))
         pieces += _turn_arrow(subject, panel)
     framed = _framed(panel, key, pieces)
-    bottom, below = _below(panel, f"{_scale_text(panel.scale)} at 100 % print size, {subject.view.words}")
-    remark = "" if subject.instruction is None else subject.instruction.remark
+    words = "" if form == "screen" else f"{_scale_text(panel.scale)} at 100 % print size, {subject.view.words}"
+    bottom, below = _below(panel, words)
+    remark = "" if subject.instruction is None or form != "sheet" else subject.instruction.remark
     lines = svg.wrapped(remark, panel.width, 2.6) if remark else []
     notes = [svg.text(panel.x, bottom + 4.0 * (k + 1), line, 2.6, f'fill="{svg.INK}"') for k, line in enumerate(lines)]
     return bottom + 4.0 * len(lines) + 1.5, [*framed, *below, *notes]
 
 
-def _below(panel: _Panel, words: str) -> tuple[float, list[str]]:
+def _below(panel: Panel, words: str) -> tuple[float, list[str]]:
     """Where a panel's scale bar and caption end, and both."""
     y = panel.y + panel.height + 5.0
     step = svg.nice(0.3 * panel.width / panel.scale)
     lines = [
         svg.text(panel.x, y + 4.4 + 3.6 * k, line, 2.6, f'fill="{svg.MUTED}"')
-        for k, line in enumerate(svg.wrapped(words, panel.width, 2.6))
+        for k, line in enumerate(svg.wrapped(words, panel.width, 2.6) if words else ())
     ]
-    return y + 2.4 + 3.6 * len(lines), [svg.scale_bar(panel.x, y, step, panel.scale), *lines]
+    return y + 2.4 + 3.6 * len(lines), [svg.scale_bar(panel.x, y, step, panel.scale, 2.5 * panel.text), *lines]
 
 
-def _turn_arrow(subject: _Subject, panel: _Panel) -> list[str]:
+def _turn_arrow(subject: _Subject, panel: Panel) -> list[str]:
     """The sense of a turn about the direction of the view."""
     turn = None if subject.instruction is None else subject.instruction.turn
     if turn is None:
@@ -288,11 +271,13 @@ def _turn_arrow(subject: _Subject, panel: _Panel) -> list[str]:
     label = f"{turn.angle_deg:.2f}°"
     return [
         svg.arc_arrow(center, radius, is_clockwise=share < 0.0),
-        svg.haloed(center[0], center[1] - radius + 3.6, label, 2.8, f'fill="{svg.INK}" text-anchor="middle"'),
+        svg.haloed(
+            center[0], center[1] - radius + 3.6, label, 2.8 * panel.text, f'fill="{svg.INK}" text-anchor="middle"'
+        ),
     ]
 
 
-def _names(subject: _Subject, panel: _Panel) -> list[str]:
+def _names(subject: _Subject, panel: Panel) -> list[str]:
     """Names of neighbours in the window, and arrows at its edge to those that the instruction names."""
     told = subject.instruction
     sentence = "" if told is None else f"{told.what} {told.place} "
@@ -302,33 +287,26 @@ def _names(subject: _Subject, panel: _Panel) -> list[str]:
     for target in targets_of(subject.part):
         if target.name in (subject.nominal.name, subject.standing.seat) or target.normal_in_model is not None:
             continue
-        is_told = f" {target.name}{_after(sentence, target.name)}" in sentence
+        is_told = re.search(rf"(?<!\w){re.escape(target.name)}(?!\w)", sentence) is not None
         place = panel.at(subject.view.to_plane(target.point_in_model))
         if panel.holds(place, 2.0):
             if low[0] < place[0] < high[0] and high[1] < place[1] < low[1] and not is_told:
                 continue
             weight = ' font-weight="600"' if is_told else ""
-            color = svg.INK if is_told else svg.MUTED
-            attributes = f'fill="{color}" text-anchor="middle"{weight}'
-            pieces.append(svg.haloed(place[0], place[1] + 0.9, target.name, 2.6, attributes))
+            attributes = f'fill="{svg.INK if is_told else svg.MUTED}" text-anchor="middle"{weight}'
+            half = 0.3 * 2.6 * panel.text * len(target.name)
+            x = float(np.clip(place[0], panel.x + half, panel.x + panel.width - half))
+            pieces.append(svg.haloed(x, place[1] + 0.9, target.name, 2.6 * panel.text, attributes))
         elif is_told:
             pieces += _pointer(panel, center, place, target.name)
     return pieces
 
 
-def _after(sentence: str, name: str) -> str:
-    """The character behind the first whole mention of a name, so that post_1 is not found in post_12."""
-    at = sentence.find(f" {name}")
-    while at >= 0:
-        follows = sentence[at + 1 + len(name) : at + 2 + len(name)]
-        if not (follows.isalnum() or follows == "_"):
-            return follows
-        at = sentence.find(f" {name}", at + 1)
-    return "\0"
+def _pointer(panel: Panel, center: Array, place: Array, name: str) -> list[str]:
+    """The name of something outside at the edge of a panel, with a small sign of where it lies; none straight behind.
 
-
-def _pointer(panel: _Panel, center: Array, place: Array, name: str) -> list[str]:
-    """An arrow at the edge of a panel to something outside, with its name; none to what is straight behind."""
+    The sign is open and pale: the only arrows of a drawing are those of the moves.
+    """
     arm = place - center
     if float(np.hypot(*arm)) < 1.0:
         return []
@@ -337,35 +315,62 @@ def _pointer(panel: _Panel, center: Array, place: Array, name: str) -> list[str]
     edge = np.where(arm > 0.0, middle + half, middle - half) - center
     reach = min(float(edge[axis] / arm[axis]) for axis in range(2) if abs(arm[axis]) > 1e-9)
     tip = center + reach * arm
-    tail = tip - 6.0 * arm / np.hypot(*arm)
+    along = arm / np.hypot(*arm)
+    tail = tip - 3.0 * along
+    aside = np.array([-along[1], along[0]])
+    chevron = np.stack([tail + 1.3 * aside, tip, tail - 1.3 * aside])
     anchor = (
         "end" if tip[0] > middle[0] + 0.5 * half[0] else "start" if tip[0] < middle[0] - 0.5 * half[0] else "middle"
     )
     x = float(np.clip(tail[0], panel.x + 2.0, panel.x + panel.width - 2.0))
-    y = float(np.clip(tail[1] + (3.4 if tip[1] < middle[1] else -1.6), panel.y + 4.0, panel.y + panel.height - 2.0))
+    drop = (3.4 if tip[1] < middle[1] else -1.6) * panel.text
+    y = float(np.clip(tail[1] + drop, panel.y + 4.0, panel.y + panel.height - 2.0))
     return [
-        svg.arrow(tail, tip, 0.35, svg.INK),
-        svg.haloed(x, y, f"to {name}", 2.6, f'fill="{svg.INK}" font-weight="600" text-anchor="{anchor}"'),
+        svg.path([chevron], f'stroke="{svg.MUTED}" stroke-width="0.5"'),
+        svg.haloed(x, y, name, 2.6 * panel.text, f'fill="{svg.MUTED}" font-weight="600" text-anchor="{anchor}"'),
     ]
 
 
-def _side(subject: _Subject, x: float, y: float, key: str) -> tuple[float, list[str]]:
-    """The right column: the displacement magnified, or the whole part for a missing component; and the legend."""
+def _is_whole(subject: _Subject) -> bool:
+    """Whether the second panel shows the whole part, because there is no displacement."""
+    return subject.deviation.finding is Finding.MISSING or subject.measured is None
+
+
+def _side_panel(subject: _Subject, x: float, y: float, width: float) -> Panel:
+    """The second panel: the displacement magnified, or the whole part for a missing component."""
+    panel = (_whole_part if _is_whole(subject) else _magnified)(subject, x, y, width)
+    return panel if width == SIDE_WIDTH_MM else replace(panel, text=SCREEN_TEXT)
+
+
+def _about(subject: _Subject, panel: Panel) -> str:
+    """What a drawing on a screen shows, as JSON."""
     one = subject.deviation
-    if one.finding is Finding.MISSING or subject.measured is None:
-        panel = _whole_part(subject, x, y)
+    is_whole = _is_whole(subject)
+    told = {
+        "text": subject.view.words,
+        "magnification": None if is_whole else panel.scale,
+        "u": f"{one.uncertainty_mm:.2g}" if one.uncertainty_mm and not is_whole else "",
+        "tolerance": exact(one.tolerance_mm) if one.tolerance_mm is not None and not is_whole else "",
+        "place": "" if is_whole else subject.standing.point,
+    }
+    return json.dumps(with_messages(told), ensure_ascii=False)
+
+
+def _side(subject: _Subject, panel: Panel, key: str, form: Form) -> tuple[float, list[str]]:
+    """Where the second panel ends, and its pieces; with the legend."""
+    x = panel.x
+    if _is_whole(subject):
         pieces = _framed(panel, key, _outlines(subject, panel, with_others=True))
         words = "the whole part; it belongs at the thick outline"
     else:
-        panel = _magnified(subject, x, y)
         pieces = _framed(panel, key, _displacement(subject, panel))
         words = f"magnified {panel.scale:g} times"
         hidden = [move.text.removeprefix("move ") for move in _moves_along_view(subject, panel)]
         if hidden:
             words = f"{words}; not seen: {', '.join(hidden)}"
-    bottom, below = _below(panel, words)
+    bottom, below = _below(panel, "" if form == "screen" else words)
     pieces += below
-    rows = _legend(subject)
+    rows = _legend(subject) if form == "sheet" else []
     for k, (sample, label) in enumerate(rows):
         row = bottom + 4.4 + 4.2 * k
         pieces.append(f'<g transform="translate({x:g} {row:.2f})">{sample}</g>')
@@ -373,35 +378,34 @@ def _side(subject: _Subject, x: float, y: float, key: str) -> tuple[float, list[
     return bottom + 4.4 + 4.2 * len(rows), pieces
 
 
-def _moves_along_view(subject: _Subject, panel: _Panel) -> list[ReworkMove]:
+def _moves_along_view(subject: _Subject, panel: Panel) -> list[ReworkMove]:
     """Moves that are too short to be seen in a panel, because they are along the view or small."""
     moves = () if subject.instruction is None else subject.instruction.moves
     return [move for move in moves if _drawn_length(subject, panel, move) < 0.8]
 
 
-def _drawn_length(subject: _Subject, panel: _Panel, move: ReworkMove) -> float:
+def _drawn_length(subject: _Subject, panel: Panel, move: ReworkMove) -> float:
     step = subject.view.axes[:2] @ np.array(move.axis_in_model) * move.distance_mm * panel.scale
     return float(np.hypot(*step))
 
 
-def _whole_part(subject: _Subject, x: float, y: float) -> _Panel:
+def _whole_part(subject: _Subject, x: float, y: float, width: float) -> Panel:
     corners = np.array(np.meshgrid(*subject.part.model.bounds_in_model.T)).reshape(3, -1).T
     flat = subject.view.to_plane(corners)[:, :2]
     size = flat.max(axis=0) - flat.min(axis=0)
-    width = SIDE_WIDTH_MM
     scale = float(min((width - 4.0) / size[0], (width - 4.0) / size[1]))
-    return _Panel(x, y, width, width, 0.5 * (flat.min(axis=0) + flat.max(axis=0)), scale)
+    return Panel(x, y, width, width, 0.5 * (flat.min(axis=0) + flat.max(axis=0)), scale)
 
 
-def _magnified(subject: _Subject, x: float, y: float) -> _Panel:
-    one, width = subject.deviation, SIDE_WIDTH_MM
+def _magnified(subject: _Subject, x: float, y: float, width: float) -> Panel:
+    one = subject.deviation
     away = float(np.hypot(*(subject.measured_point - subject.design_point)))
     reach = 1.15 * max(one.tolerance_mm or 0.0, away + (one.uncertainty_mm or 0.0), 1e-3)
     scale = min(MAX_MAGNIFICATION, svg.nice(0.5 * width / reach, (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0)))
-    return _Panel(x, y, width, width, subject.design_point, scale)
+    return Panel(x, y, width, width, subject.design_point, scale)
 
 
-def _displacement(subject: _Subject, panel: _Panel) -> list[str]:
+def _displacement(subject: _Subject, panel: Panel) -> list[str]:
     """Tolerance zone, design point, measured point with its U, and the moves from one to the other."""
     one, told = subject.deviation, subject.instruction
     pieces = _outlines(subject, panel, with_others=False)
@@ -434,7 +438,7 @@ def _displacement(subject: _Subject, panel: _Panel) -> list[str]:
     return pieces + [_move_label(panel, *label, middle) for label in labels]
 
 
-def _move_label(panel: _Panel, start: Array, end: Array, text: str, middle: Array) -> str:
+def _move_label(panel: Panel, start: Array, end: Array, text: str, middle: Array) -> str:
     """Length of a move beside its arrow, on the side away from the middle of all arrows."""
     arm = end - start
     across_arm = np.array([-arm[1], arm[0]]) / float(np.hypot(*arm))
@@ -446,7 +450,9 @@ def _move_label(panel: _Panel, start: Array, end: Array, text: str, middle: Arra
     amount = text.split(" mm", 1)[0].removeprefix("move ").split(" ± ")[0]
     x = float(np.clip(place[0], panel.x + 2.0, panel.x + panel.width - 2.0))
     y = float(np.clip(place[1] + 0.8, panel.y + 4.0, panel.y + panel.height - 2.0))
-    return svg.haloed(x, y, f"{amount} mm", 3.0, f'fill="{svg.INK}" font-weight="600" text-anchor="{anchor}"')
+    return svg.haloed(
+        x, y, f"{amount} mm", 3.0 * panel.text, f'fill="{svg.INK}" font-weight="600" text-anchor="{anchor}"'
+    )
 
 
 def _legend(subject: _Subject) -> list[tuple[str, str]]:
@@ -466,6 +472,6 @@ def _legend(subject: _Subject) -> list[tuple[str, str]]:
         rows.append((f'{dots}stroke-dasharray="0.5 0.7"/>', f"U = {one.uncertainty_mm:.2g} mm"))
     if one.tolerance_mm is not None:
         zone = f'<circle cx="4" cy="-0.9" r="1.7" fill="{svg.ZONE}" fill-opacity="0.1" stroke="{svg.ZONE}" '
-        words = f"tolerance zone, ± {exact(one.tolerance_mm)} mm"
+        words = f"tolerance zone, radius {exact(one.tolerance_mm)} mm"
         rows.append((f'{zone}stroke-width="0.4" stroke-dasharray="3 1 0.6 1"/>', words))
     return rows

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import re
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import reduce
 
 import numpy as np
 
 from arview.cad import Part, ReworkSettings
+from arview.core.messages import CATALOGUE, Message, sentence
 from arview.geometry import Array
 from arview.inspection import ComponentDeviation, Finding, Inspection, Verdict, decimals_of, fixed
 from arview.quality.rework.correction import Correction, Standing, correction_of, standing_of
@@ -22,6 +25,7 @@ from arview.quality.rework.words import (
     in_named_steps,
     lateral_directions,
     name_of,
+    seen_along,
     targets_of,
     up_of,
 )
@@ -62,8 +66,8 @@ class _Names:
 
     declared: list[NamedDirection]
     found: list[NamedDirection]
-    away: str
-    against: str
+    away: str | Message
+    against: str | Message
 
     @property
     def all(self) -> list[NamedDirection]:
@@ -78,21 +82,26 @@ def _instruction(one: ComponentDeviation, part: Part, targets: Sequence[Target])
         install = (*INSTALL_STEPS, FIXING.get(settings.name, ANY_FIXING), LAST_STEP)
         steps = _filled(install, one.name, "", place)
         return Instruction(
-            one.name, "install", "install it", text=settings.text, steps=steps, place=place, pictures=settings.pictures
+            one.name,
+            "install",
+            sentence("rework.install"),
+            text=settings.text,
+            steps=steps,
+            place=place,
+            pictures=settings.pictures,
         )
     correction = correction_of(one, standing)
     names = names_for(standing, part, targets, settings)
     moves = _moves(one, standing, correction, names, part)
     turn = _turn(one, standing, correction, names, part)
     texts = [move.text for move in moves] + ([] if turn is None else [turn.text])
-    what = ", then ".join(texts) if texts else "bring it to its design place"
+    what = _joined("rework.then", texts) if texts else sentence("rework.bring")
     if settings.name == "shim":
         texts = [*_shims(standing, moves, turn, names, correction), *texts]
-    sentence = ", then ".join(texts) if texts else what
     usual = settings.steps or STEPS.get(settings.name, STEPS["adjust"])
-    steps = _filled((*usual, LAST_STEP), one.name, f"{sentence[:1].upper()}{sentence[1:]}", place)
+    steps = _filled((*usual, LAST_STEP), one.name, _joined("rework.then", texts) if texts else what, place)
     if settings.name == "replace":
-        what = f"replace it; it stands wrong: to be right it would have to {what}"
+        what = sentence("rework.replace", what=what)
     return Instruction(
         component=one.name,
         how=settings.name,
@@ -107,13 +116,29 @@ def _instruction(one: ComponentDeviation, part: Part, targets: Sequence[Target])
     )
 
 
+def _joined(key: str, texts: Iterable[str]) -> str:
+    """Several texts as one, each with the next by a sentence with the values ``first`` and ``second``."""
+    return reduce(lambda first, second: sentence(key, first=first, second=second), texts)
+
+
 def _filled(steps: Sequence[str], component: str, move: str, place: str) -> tuple[str, ...]:
-    """Steps with their placeholders filled; each ends with a full stop."""
-    filled = []
-    for step in steps:
-        text = step.replace("{component}", component).replace("{move}", move).replace("{place}", place).strip()
-        filled.append(text if text[-1:] in ".!?" else f"{text}.")
-    return tuple(filled)
+    """Steps with their values, keys of sentences or of the part file; moves begin with a capital, all have a stop."""
+    values = {"component": component, "move": move, "place": place}
+    own = values | {"move": f"{move[:1].upper()}{move[1:]}"}
+    told = [
+        sentence(step, **values)
+        if step in CATALOGUE
+        else re.sub(r"\{(component|move|place)\}", lambda found: own[found[1]], step).strip()
+        for step in steps
+    ]
+    return tuple(
+        Message(f"{text[:1].upper()}{text[1:]}", text.key, text.values)
+        if isinstance(text, Message)
+        else text
+        if text[-1:] in ".!?"
+        else f"{text}."
+        for text in told
+    )
 
 
 def names_for(standing: Standing, part: Part, targets: Sequence[Target], settings: ReworkSettings) -> _Names:
@@ -126,7 +151,7 @@ def names_for(standing: Standing, part: Part, targets: Sequence[Target], setting
     for axis in settings.axes:
         if axis.direction_in_model is not None:
             direction = np.array(axis.direction_in_model)
-            words = axis.name, f"opposite to “{axis.name}”"
+            words: tuple[str, str] = axis.name, sentence("rework.opposite", name=axis.name)
             if abs(direction @ normal) > 0.9:
                 away, against = words if direction @ normal > 0 else words[::-1]
                 continue
@@ -136,7 +161,7 @@ def names_for(standing: Standing, part: Part, targets: Sequence[Target], setting
             if aim is None:
                 continue  # it is straight above or below, so that moves across the seat cannot be called by it
             direction = aim[0] if axis.verb == "towards" else -aim[0]
-            words = f"towards {axis.target}", f"away from {axis.target}"
+            words = sentence("rework.towards", target=axis.target), sentence("rework.away_from", target=axis.target)
             words = words if axis.verb == "towards" else words[::-1]
             words = (axis.name or words[0], words[1])
         lateral = across(direction, normal)
@@ -150,12 +175,9 @@ def _seat_words(standing: Standing, part: Part) -> tuple[str, str]:
     """Names of the directions away from the seat and against it."""
     rise = float(standing.normal_in_model @ up_of(part))
     if not standing.seat:
-        return "up", "down"
-    if rise > 0.9:
-        return f"up, away from {standing.seat}", f"down, towards {standing.seat}"
-    if rise < -0.9:
-        return f"down, away from {standing.seat}", f"up, towards {standing.seat}"
-    return f"out, away from {standing.seat}", f"in, towards {standing.seat}"
+        return sentence("rework.up"), sentence("rework.down")
+    away, against = ("up", "down") if rise > 0.9 else ("down", "up") if rise < -0.9 else ("out", "in")
+    return sentence(f"rework.{away}_from", seat=standing.seat), sentence(f"rework.{against}_to", seat=standing.seat)
 
 
 def _moves(
@@ -186,7 +208,7 @@ def _moves(
 
 def _move(step: NamedStep, uncertainty_mm: float) -> ReworkMove:
     return ReworkMove(
-        text=f"move {amount(step.length, uncertainty_mm)} mm {step.direction.text}",
+        text=sentence("rework.move", amount=amount(step.length, uncertainty_mm), direction=step.direction.text),
         axis_in_model=_three(step.axis_in_model),
         distance_mm=step.length,
         uncertainty_mm=uncertainty_mm,
@@ -205,7 +227,8 @@ def _turn(
     ends_mm = angle * standing.radius_mm
     if limit is None and (one.tolerance_mm is None or ends_mm <= END_SHARE * one.tolerance_mm):
         return None
-    texts, kept = [], np.zeros(3)
+    texts: list[str] = []
+    kept = np.zeros(3)
     tilt = across(rotation, own)
     size = float(np.linalg.norm(tilt))
     if size > 1e-9:
@@ -216,15 +239,21 @@ def _turn(
     twist = float(rotation @ own)
     u = correction.turn_uncertainty_rad(own)
     if abs(twist) > max(u, np.deg2rad(MIN_TURN_DEG)):
-        word = "counter-clockwise" if twist > 0 else "clockwise"
-        texts.append(f"turn {_degrees(abs(twist), u)}° {word} {_seen(standing, part)}")
+        sense = "counter_clockwise" if twist > 0 else "clockwise"
+        texts.append(
+            sentence(
+                f"rework.{sense}",
+                angle=_degrees(abs(twist), u),
+                seen=seen_along(standing.axis_in_model, standing.seat, up_of(part)),
+            )
+        )
         kept = kept + own * twist
     if not texts:
         return None
     angle = float(np.linalg.norm(kept))
     axis = kept / angle
     u = correction.turn_uncertainty_rad(axis)
-    return ReworkTurn(" and ".join(texts), _three(axis), float(np.rad2deg(angle)), float(np.rad2deg(u)))
+    return ReworkTurn(_joined("rework.and", texts), _three(axis), float(np.rad2deg(angle)), float(np.rad2deg(u)))
 
 
 def _tilt_text(tilt: Array, u: float, standing: Standing, names: _Names) -> str:
@@ -232,43 +261,36 @@ def _tilt_text(tilt: Array, u: float, standing: Standing, names: _Names) -> str:
     size = float(np.linalg.norm(tilt))
     lean = np.cross(tilt, standing.axis_in_model)
     steps = in_named_steps(lean, names.declared, names.found, max(u, 0.25 * size))
-    parts = [f"{_degrees(step.length, u)}° {step.direction.text}" for step in steps if step.length > u] or [
-        f"{_degrees(size, u)}° {steps[0].direction.text}"
+    named = [(step.length, step.direction.text) for step in steps if step.length > u] or [
+        (size, steps[0].direction.text)
     ]
-    return f"tilt its free end {' and '.join(parts)}"
-
-
-def _seen(standing: Standing, part: Part) -> str:
-    """From where a turn is seen for which the own axis points at the eye."""
-    rise = float(standing.axis_in_model @ up_of(part))
-    if rise > 0.9:
-        return "seen from above"
-    if rise < -0.9:
-        return "seen from below"
-    return f"seen with {standing.seat} behind it" if standing.seat else "seen from its free end"
+    parts = [sentence("rework.degrees", angle=_degrees(length, u), direction=text) for length, text in named]
+    return sentence("rework.tilt", parts=_joined("rework.and", parts))
 
 
 def _shims(
     standing: Standing, moves: Sequence[ReworkMove], turn: ReworkTurn | None, names: _Names, correction: Correction
 ) -> list[str]:
     """Thickness of the shims that the move away from the seat, and the tilt, ask for."""
-    texts = []
-    under = f"between {standing.component} and {standing.seat}" if standing.seat else f"under {standing.component}"
+    texts: list[str] = []
+    component, seat = standing.component, standing.seat
+    under = (
+        sentence("rework.between", component=component, seat=seat)
+        if seat
+        else sentence("rework.under", component=component)
+    )
     for move in moves:
         rise = float(np.array(move.axis_in_model) @ standing.normal_in_model)
-        if rise > 0.99:
-            texts.append(f"put shims of {amount(move.distance_mm, move.uncertainty_mm)} mm {under}")
-        elif rise < -0.99:
-            texts.append(
-                f"take {amount(move.distance_mm, move.uncertainty_mm)} mm of shims out {under}, or dress the seat by it"
-            )
+        if abs(rise) > 0.99:
+            way = "rework.shims_in" if rise > 0.0 else "rework.shims_out"
+            texts.append(sentence(way, amount=amount(move.distance_mm, move.uncertainty_mm), under=under))
     if turn is not None:
         tilt = across(np.array(turn.axis_in_model) * np.deg2rad(turn.angle_deg), standing.axis_in_model)
         size = float(np.linalg.norm(tilt))
         if size > correction.turn_uncertainty_rad(tilt / size if size else tilt):
             lean = np.cross(tilt, standing.axis_in_model) / size
             side = name_of(-lean, names.all)
-            texts.append(f"put the thicker shims on the side {side}: {1000.0 * np.tan(size):.1f} mm for 1 m of width")
+            texts.append(sentence("rework.shims_side", side=side, slope=f"{1000.0 * np.tan(size):.1f}"))
     return texts
 
 
@@ -281,44 +303,47 @@ def _remark(
     turn: ReworkTurn | None,
 ) -> str:
     """What is not known, and what the distances refer to."""
-    sentences = []
+    sentences: list[str] = []
     normal = standing.normal_in_model
     for direction in correction.free_shifts:
         is_height = abs(direction @ normal) > 0.9
         lateral = across(direction, normal)
         name = names.away if is_height else name_of(lateral / np.linalg.norm(lateral), names.all)
-        sentences.append(f"How far it is off {name}, or the other way, was not determined.")
+        sentences.append(sentence("rework.free_shift", direction=name))
     own = standing.axis_in_model
     for axis in correction.free_turns:
         is_twist = abs(axis @ own) > 0.9
         if is_twist and standing.is_round:
             continue  # turning it changes nothing
-        sentences.append(f"Its {'turn about its own axis' if is_twist else 'tilt'} was not determined.")
+        sentences.append(sentence("rework.free_twist" if is_twist else "rework.free_tilt"))
     if not moves and one.tolerance_mm is not None and one.distance_mm is not None:
-        sentences.append("Its distance is within its U or the tolerance: no move is asked for.")
+        sentences.append(sentence("rework.no_move"))
     if moves and turn is not None:
-        sentences.append(f"The moves are those of one point: {standing.point}; turn it about that point.")
-    return " ".join(dict.fromkeys(sentences))
+        sentences.append(sentence("rework.of_point", point=standing.point))
+    told = dict.fromkeys(sentences)
+    return _joined("rework.both", told) if told else ""
 
 
 def _place(standing: Standing, targets: Sequence[Target]) -> str:
     """Where a component belongs: on what, and how far from two things beside it in different directions."""
-    aims = []
-    for target in targets:
-        aim = None
-        if target.name not in (standing.component, standing.seat):
-            aim = aim_of(target, standing.center_in_model, standing.normal_in_model)
-        if aim is not None and target.normal_in_model is None:
-            aims.append((aim[1] * (1.0 + target.cost), target.name, *aim))
-    aims.sort(key=lambda one: one[0])
+    aims = sorted(
+        (aim[1] * (1.0 + target.cost), target.name, *aim)
+        for target in targets
+        if target.normal_in_model is None
+        and target.name not in (standing.component, standing.seat)
+        and (aim := aim_of(target, standing.center_in_model, standing.normal_in_model)) is not None
+    )
     chosen = aims[:1]
     for one in aims[1:]:
         if abs(float(one[2] @ chosen[0][2])) < 0.87:
             chosen.append(one)
             break
-    beside = " and ".join(f"{reach:.0f} mm from {name}" for _, name, _, reach in chosen)
-    on = f"on {standing.seat}" if standing.seat else ""
-    return ", ".join(part for part in (on, beside) if part) or "as its drawing shows"
+    parts = [sentence("rework.beside", reach=f"{reach:.0f}", name=name) for _, name, _, reach in chosen]
+    told = [
+        *([sentence("rework.on", seat=standing.seat)] if standing.seat else []),
+        *([_joined("rework.and", parts)] if parts else []),
+    ]
+    return _joined("rework.place", told) if told else sentence("rework.as_drawn")
 
 
 def amount(value: float, uncertainty: float) -> str:

@@ -71,12 +71,12 @@ def arc_arrow(center: Array, radius: float, is_clockwise: bool) -> str:
     return shaft + arrow(points[-4], points[-1] + 0.6 * (points[-1] - points[-4]))
 
 
-def scale_bar(x: float, y: float, length_mm: float, magnification: float) -> str:
+def scale_bar(x: float, y: float, length_mm: float, magnification: float, size: float = 2.5) -> str:
     """A bar of a true length with its number; at a magnification of the drawing."""
     drawn = length_mm * magnification
     ticks = [np.array([[x, y - 1.0], [x, y], [x + drawn, y], [x + drawn, y - 1.0]])]
     label = f"{length_mm:g} mm"
-    return path(ticks, f'stroke="{INK}" stroke-width="0.35"') + text(x + drawn + 1.2, y, label, 2.5, f'fill="{INK}"')
+    return path(ticks, f'stroke="{INK}" stroke-width="0.35"') + text(x + drawn + 1.2, y, label, size, f'fill="{INK}"')
 
 
 def cross(center: Array, size: float, color: str) -> str:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from arview.cad import Part
+from arview.core.messages import Message, sentence
 from arview.geometry import Array
 
 _SIDES = (("front", -90.0), ("back", 90.0), ("left", 180.0), ("right", 0.0))
@@ -53,7 +54,7 @@ class NamedDirection:
     """
 
     in_model: Array
-    text: str
+    text: str | Message
     cost: float = 0.0
 
 
@@ -104,18 +105,21 @@ def targets_of(part: Part, absent: Sequence[str] = (), wrong: Sequence[str] = ()
         absent: components that are missing from the specimen, which are not named.
         wrong: components that are out of tolerance, which are named last.
     """
-    found = []
-    for datum in part.datums:
-        if datum.feature == "fit":
-            continue
-        normal = np.array(datum.direction_in_model) if datum.feature == "plane" else None
-        found.append(Target(datum.feature_name, np.array(datum.point_in_model), normal))
-    for component in part.model.components:
-        if component.name in absent:
-            continue
-        cost = COMPONENT_COST + WRONG_COST * (component.name in wrong)
-        found.append(Target(component.name, component.bounds_in_model.mean(axis=0), None, cost))
-    return found
+    features = (
+        Target(
+            datum.feature_name,
+            np.array(datum.point_in_model),
+            np.array(datum.direction_in_model) if datum.feature == "plane" else None,
+        )
+        for datum in part.datums
+        if datum.feature != "fit"
+    )
+    components = (
+        Target(one.name, one.bounds_in_model.mean(axis=0), None, COMPONENT_COST + WRONG_COST * (one.name in wrong))
+        for one in part.model.components
+        if one.name not in absent
+    )
+    return [*features, *components]
 
 
 def lateral_directions(
@@ -137,29 +141,34 @@ def lateral_directions(
         seat: name of what it stands on, which is no target either.
     """
     bases = {settings.name for settings in part.settings if settings.role == "base"} | {component, seat}
-    aims = []
-    for target in targets:
-        aim = None if target.name in bases else aim_of(target, center, normal)
-        if aim is not None:
-            aims.append((target, *aim))
+    aims = [
+        (target, *aim)
+        for target in targets
+        if target.name not in bases and (aim := aim_of(target, center, normal)) is not None
+    ]
     nearest = min((reach for _, _, reach in aims), default=1.0)
     found = []
     for target, direction, reach in aims:
         cost = target.cost + min(MAX_FAR_COST, FAR_COST * float(np.log2(reach / nearest)))
-        found.append(NamedDirection(direction, f"towards {target.name}", cost))
-        found.append(NamedDirection(-direction, f"away from {target.name}", 1.5 * cost + AWAY_COST))
+        found.append(NamedDirection(direction, sentence("rework.towards", target=target.name), cost))
+        found.append(
+            NamedDirection(-direction, sentence("rework.away_from", target=target.name), 1.5 * cost + AWAY_COST)
+        )
     up = up_of(part)
     rise = across(up, normal)
     if np.linalg.norm(rise) > 0.5:
         slope = float(np.rad2deg(np.arccos(np.clip(np.linalg.norm(rise), 0.0, 1.0))))
-        words = ("up", "down") if slope < MAX_ANGLE_DEG else ("up the slope", "down the slope")
+        where = "" if slope < MAX_ANGLE_DEG else "_slope"
         rise = rise / np.linalg.norm(rise)
-        found += [NamedDirection(rise, words[0]), NamedDirection(-rise, words[1])]
+        found += [
+            NamedDirection(rise, sentence(f"rework.up{where}")),
+            NamedDirection(-rise, sentence(f"rework.down{where}")),
+        ]
     for side, azimuth_deg in _SIDES:
         direction = across(part.effective_view_range.direction(azimuth_deg, 0.0), normal)
         if np.linalg.norm(direction) > 0.7:
             direction = direction / np.linalg.norm(direction)
-            found.append(NamedDirection(direction, f"towards the {side} of the part", SIDE_COST))
+            found.append(NamedDirection(direction, sentence(f"rework.{side}"), SIDE_COST))
     return found
 
 
@@ -189,7 +198,7 @@ def in_named_steps(
     """A vector across the seat's normal as one or two steps along directions that have a name.
 
     One step is taken along the vector itself, called by a direction near it, if following the name exactly would leave
-    no more than ``sideways``. Otherwise two steps add up to the vector exactly.
+    no more than ``sideways``. Otherwise two steps add up to the vector exactly, neither of them longer than it.
 
     Args:
         vector: (3,), not zero.
@@ -204,7 +213,7 @@ def in_named_steps(
     length = float(np.linalg.norm(vector))
     axis = vector / length
     best = max([*declared, *found], key=lambda one: float(one.in_model @ axis), default=None)
-    text = "in the direction of the arrow" if best is None else f"{best.text}, as the arrow of the drawing shows"
+    text = sentence("rework.arrow") if best is None else sentence("rework.about", direction=best.text)
     return [NamedStep(NamedDirection(axis, text), axis, length, axis)]
 
 
@@ -225,7 +234,7 @@ def _best_steps(vector: Array, pool: Sequence[NamedDirection], sideways: float) 
                 continue
             rows = np.linalg.pinv(np.stack([one.in_model, other.in_model], axis=1))
             lengths = rows @ vector
-            if lengths.min() <= 0.0:
+            if lengths.min() <= 0.0 or lengths.max() > length:
                 continue
             detour = max(0.0, float(lengths.sum()) / length - np.sqrt(2.0))
             cost = one.cost + other.cost + PAIR_COST + OBLIQUE_COST * abs(between - 90.0) / 45.0
@@ -238,7 +247,14 @@ def _best_steps(vector: Array, pool: Sequence[NamedDirection], sideways: float) 
     return best[1]
 
 
-def name_of(direction: Array, found: Sequence[NamedDirection]) -> str:
+def seen_along(direction: Array, seat: str, up: Array) -> Message:
+    """From where something is seen when a direction (3,) points at the eye, away from what it stands on."""
+    rise = float(direction @ up)
+    where = "above" if rise > 0.9 else "below" if rise < -0.9 else "seat" if seat else "end"
+    return sentence(f"rework.seen_{where}", seat=seat)
+
+
+def name_of(direction: Array, found: Sequence[NamedDirection]) -> str | Message:
     """Name of the direction nearest to a given one (3,), for a remark that needs no exactness."""
     best = max(found, key=lambda one: float(one.in_model @ direction) - 0.05 * one.cost, default=None)
-    return "a direction without a name" if best is None else best.text
+    return sentence("rework.unnamed") if best is None else best.text

@@ -229,7 +229,7 @@ class CaptureGuide:
     def _way(self, here: Array | None) -> Message:
         """Where to go next."""
         if self.needs.is_enough:
-            return sentence("capture.enough_of", count=self.needs.photos)
+            return sentence("capture.enough")
         plan = self.needs.plan
         if here is None:
             return words.more_message(len(plan), ())

@@ -13,7 +13,7 @@ from arview.geometry import Array, apply
 OTHER_SIDE_DEG = 110.0
 """Angle between two directions of the part from which one is said to be on its other side."""
 MAX_SIDES = 2
-"""Sides that a text names."""
+"""Sides that a text names; photos from others are counted together."""
 MAX_NAMES = 2
 """Components that a text names; of more only the number is given."""
 
@@ -46,7 +46,10 @@ def more_message(count: int, sides: Sequence[Message]) -> Message:
         return sentence("capture.more_one" if count == 1 else "capture.more", count=count)
     if len(counts) == 1:
         return sentence("capture.more_from", count=count, side=sides[0])
-    named = tuple(sentence("capture.from", count=number, side=side) for side, number in counts.most_common(MAX_SIDES))
+    common = counts.most_common(MAX_SIDES)
+    named = tuple(sentence("capture.from", count=number, side=side) for side, number in common)
+    if rest := count - sum(number for _, number in common):
+        named += (sentence("capture.from_others", count=rest),)
     return sentence("capture.more_of", count=count, sides=named)
 
 

@@ -93,6 +93,9 @@ something could not be stored; then it is not confirmed.
     ``no_such_frame``.
 ``POST /api/jobs/JOB/end``, ``POST /api/jobs/JOB/reopen``
     No more photos come, or more come after all: *Job*. A photo that was announced before still counts after the end.
+    A measurement that runs is ended by the second, and begins anew after the next end.
+``DELETE /api/jobs/JOB/photos/NAME?why=blurred``
+    *Job* without this photo, which counts no more; ``why``: a word for the log. 400 after the end.
 ``POST /api/jobs/JOB/recheck`` ``{"components": [names]}``
     201 *Job* that measures these components again; 409 ``not_done`` before the first measurement.
 ``POST /api/jobs/JOB/decisions`` ``{"component", "is_ok", "reason", "note", "by", "photo": name | null}``, ``…/ticks``
@@ -102,7 +105,7 @@ something could not be stored; then it is not confirmed.
     them.
 ``GET /api/jobs/JOB/report.html``, ``inspection.json``, ``decisions.csv``, ``photos/NAME``, ``rework/COMPONENT.svg``,
 ``rework/PICTURE``
-    Files of the job; a picture by the name that an instruction has for it.
+    Files of the job; a picture by the name that an instruction has for it, a drawing with ``?screen`` for a page.
 
 WebRTC
 ======
@@ -206,9 +209,12 @@ Job::
      "state": state.json, "is_ended", "photos": [names],
      "attachments": [names of photos taken for decisions], "uploads": [{"upload", "bytes", "offset"}],
      "worker": as above,
+     "measuring_s": since the end of the photos | null, "expected_s": from there to the verdict, by earlier jobs of the
+     part | null,
      "faults": [texts], damaged lines of the list of photos,
      "inspection": {"created", "verdict", "sentence", "note", "components": [{"name", "verdict", "value_text",
-                    "detail_text", "distance_mm", "uncertainty_mm"}]} | null,
+                    "detail_text", "distance_mm", "uncertainty_mm", "tolerance_mm", "displacement_mm", "tilt_deg",
+                    "twist_deg"}]} | null,
      "rework": [instructions, see `arview.quality.rework.instruction_document`],
      "decisions": [entries of the log, ticks included], "signed": entry | null: a signature that holds,
      "record": {"sentence", "is_released", …} | null, see `arview.quality.decisions.state_document`,

@@ -4,7 +4,8 @@
 |---|---|
 | ``job.json`` | part, serial, camera; of a re-check also its first measurement and the components |
 | ``photos/`` | the photos as they were received |
-| ``photos.jsonl`` | a line for each photo, for the end of the walk, and for its reopening; append-only |
+| ``photos.jsonl`` | a line for each photo, for one taken back, for the end of the walk and its reopening; append-only |
+| ``taken_back/`` | photos that were taken back, which count no more |
 | ``state.json`` | `WalkState`, written by the worker |
 | ``part/`` | the part file, its CAD and what they name, as they were when the job began |
 | ``rough/inspection.json`` | provisional numbers of the first photos |
@@ -209,8 +210,27 @@ class JobFolder:
             self._append(vars(photo), log)
         return name
 
+    def take_back(self, name: str, why: str = "unwanted") -> None:
+        """Take a photo back: it is moved to ``taken_back/`` and counts no more.
+
+        Args:
+            name: of the photo.
+            why: a word for the log, such as ``blurred``.
+
+        Raises:
+            InputError: there is no such photo, or the walk has ended.
+            OutputError: the folder cannot be written to.
+        """
+        with self._exclusive():
+            log = _read_log(self.path / "photos.jsonl")
+            if log.is_ended or name not in {photo.name for photo in log.photos}:
+                raise InputError(f"job {self.id}: {name} is no photo that can be taken back; reopen a walk that ended")
+            self._append({"taken_back": name, "why": why, "time": utc_now()}, log)
+            (self.path / "taken_back").mkdir(exist_ok=True)
+            (self.path / "photos" / name).replace(self.path / "taken_back" / name)
+
     def photos(self) -> tuple[StoredPhoto, ...]:
-        """All photos that were confirmed, in the order in which they came."""
+        """All photos that were confirmed and not taken back, in the order in which they came."""
         return _read_log(self.path / "photos.jsonl").photos
 
     def remove_unconfirmed(self) -> None:
@@ -352,10 +372,8 @@ class JobFolder:
 
 def jobs_in(folder: str | Path) -> list[JobFolder]:
     """All jobs in a folder, oldest first, each followed by its re-checks; what is no job is skipped."""
-    found = []
-    for job in sorted(_jobs_below(Path(folder)), key=lambda one: (str(one.document["created"]), one.id)):
-        found += [job, *job.rechecks()]
-    return found
+    first = sorted(_jobs_below(Path(folder)), key=lambda one: (str(one.document["created"]), one.id))
+    return [one for job in first for one in (job, *job.rechecks())]
 
 
 def start_worker(job: JobFolder) -> subprocess.Popen[bytes]:
@@ -414,6 +432,9 @@ def _read_log(path: Path) -> _Log:
         document = parse_line(line)
         if isinstance(document, dict) and ("end" in document or "reopened" in document):
             ended = _time_of(document["end"]) if "end" in document else None
+            continue
+        if isinstance(document, dict) and "taken_back" in document:
+            photos = [photo for photo in photos if photo.name != document["taken_back"]]
             continue
         try:
             photos.append(photo_of_line(document))

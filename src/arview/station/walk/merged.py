@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from arview.cad import Model
+from arview.core.messages import joined, sentence
 from arview.inspection import ComponentDeviation, Inspection, Verdict
 from arview.station.walk.job import JobFolder
 
@@ -75,8 +76,14 @@ def _merged(first: JobFolder, rechecks: list[JobFolder], model: Model | None) ->
         for one in found.components:
             if one.name in (recheck.components or ()) and one.name in newest:
                 newest[one.name], origins[one.name] = one, recheck.id
-        notes.append(f"{', '.join(recheck.components or ())} checked again {found.created:%Y-%m-%d %H:%M} UTC")
+        notes.append(
+            sentence(
+                "walk.checked_again",
+                names=", ".join(recheck.components or ()),
+                time=f"{found.created:%Y-%m-%d %H:%M} UTC",
+            )
+        )
     components = tuple(newest[one.name] for one in inspection.components)
-    note = "; ".join([*([inspection.provenance.note] if inspection.provenance.note else []), *notes])
+    note = joined([inspection.provenance.note, *notes])
     whole = replace(inspection, components=components, provenance=replace(inspection.provenance, note=note))
     return MergedInspection(whole, origins)

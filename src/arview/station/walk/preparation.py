@@ -24,7 +24,7 @@ class PhotoPreparation:
         memory: where features and matches are kept.
         threads: photos or pairs at a time.
         also: what else is done with the usable photos.
-        ready: number of photos that are worked on, in their order.
+        ready: photos of the job that are worked on, in their order.
     """
 
     job: JobFolder
@@ -32,7 +32,7 @@ class PhotoPreparation:
     memory: reconstruction.SparseMemory
     threads: int
     also: Callable[[Sequence[reconstruction.Photo]], None]
-    ready: int = 0
+    ready: tuple[StoredPhoto, ...] = ()
     _ends: Event = field(default_factory=Event)
     _thread: Thread | None = None
 
@@ -50,9 +50,11 @@ class PhotoPreparation:
     def _run(self) -> None:
         while not self._ends.is_set():
             photos = self.job.photos()
-            if len(photos) > self.ready:
-                self._work(photos[: self.ready + 1])
-                self.ready += 1
+            self.ready = tuple(photo for photo in photos if photo in self.ready)  # others were taken back
+            newest = next((photo for photo in photos if photo not in self.ready), None)
+            if newest is not None:
+                self._work((*self.ready, newest))
+                self.ready += (newest,)
             else:
                 self._ends.wait(0.1)
 

@@ -102,8 +102,7 @@ class WalkWorker:
                 photos = len(self.job.photos())
                 if photos != self.state.photos:
                     self._say(photos=photos, text=sentence("walk.photos", count=photos))
-                if preparation.ready >= wanted:
-                    count = preparation.ready
+                if (count := len(preparation.ready)) >= wanted:
                     is_measured = self._measure_roughly(prepared, count)
                     more = round(ROUGH_GROWTH * count)
                     wanted = more if is_measured else count + ROUGH_RETRY

@@ -8,6 +8,7 @@ import time
 from collections import OrderedDict
 from contextlib import suppress
 from pathlib import Path
+from statistics import median
 
 from arview.cad import Model
 from arview.errors import ArviewError, InputError, OutputError
@@ -25,6 +26,8 @@ logger = logging.getLogger("arview.station.live")
 
 KEPT_INSPECTIONS = 64
 """Inspections that are kept in memory."""
+KEPT_TIMES = 12
+"""Last jobs of a part by which the time of the next one is estimated."""
 _FileState = tuple[int, int, int]
 
 
@@ -141,6 +144,20 @@ class JobBoard:
             if job.id not in self._uploads:
                 self._uploads[job.id] = Uploads(job, self.options, self.space)
             return self._uploads[job.id]
+
+    def expected_s(self, job: walk.JobFolder) -> float | None:
+        """Time from the end of the photos to the verdict, s, by the last jobs of this part; None without one."""
+        with self._lock:
+            known = list(self._known.values())
+        alike = [
+            one
+            for one in known
+            if one.document["model_hash"] == job.document["model_hash"]
+            and (one.components is None) is (job.components is None)
+        ]
+        states = (one.state() for one in alike[-KEPT_TIMES:])
+        shares = [seconds / one.photos for one in states if one.photos and (seconds := one.seconds_after_last_photo)]
+        return median(shares) * len(job.photos()) if shares else None
 
     def inspection(self, job: walk.JobFolder, model: Model | None = None) -> Inspection | None:
         """What was measured of a job, rough or final; None while nothing was, or where it cannot be read."""

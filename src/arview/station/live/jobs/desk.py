@@ -265,6 +265,13 @@ class JobDesk:
         if view is not None:
             view.refresh(self.board, self.workers)
 
+    def reopen(self, job: walk.JobFolder) -> None:
+        """More photos come after all: a measurement that runs is ended, and begins anew after the next end."""
+        job.reopen()
+        self.workers.stop(job)
+        job.write_state(walk.WalkState(photos=len(job.photos())))
+        self.changed(job)
+
     def close(self) -> Callable[[], None]:
         """Tell the workers to end; returns what waits for it."""
         return self.workers.close()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import asdict
+from datetime import UTC, datetime
 from typing import Any
 
 from arview import overlay
@@ -44,7 +45,7 @@ def job_row(job: walk.JobFolder, board: JobBoard, part: int | None) -> Document:
 
 def job_document(job: walk.JobFolder, desk: JobDesk) -> Document:
     """A job with its state, photos, numbers, instructions and decisions."""
-    board, number = desk.board, desk.part_of(job)
+    board, number, ended = desk.board, desk.part_of(job), job.ended
     inspection = board.inspection(job)
     document = {
         key: value for key, value in job.document.items() if key not in ("format", "version", "part", "frozen_part")
@@ -61,6 +62,8 @@ def job_document(job: walk.JobFolder, desk: JobDesk) -> Document:
             {"upload": one.name, "bytes": one.bytes, "offset": one.offset} for one in board.uploads(job).listed()
         ],
         "worker": desk.workers.state(job.id),
+        "measuring_s": None if ended is None else (datetime.now(UTC) - ended).total_seconds(),
+        "expected_s": board.expected_s(job),
         "faults": list(job.faults()),
         "inspection": None if inspection is None else inspection_document(inspection),
         "rework": rework(job, desk),
@@ -98,6 +101,10 @@ def inspection_document(inspection: Inspection) -> Document:
                 "detail_text": overlay.detail_text(one),
                 "distance_mm": one.distance_mm,
                 "uncertainty_mm": one.uncertainty_mm,
+                "tolerance_mm": one.tolerance_mm,
+                "displacement_mm": one.displacement_mm,
+                "tilt_deg": one.tilt_deg,
+                "twist_deg": one.twist_deg,
             }
             for one in inspection.components
         ],

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 from arview.core.messages import sentence
 from arview.errors import ArviewError
-from arview.inspection import ComponentDeviation, Finding, Inspection
+from arview.inspection import ComponentDeviation, Finding, Inspection, Verdict
 from arview.station import walk
 from arview.station.live.jobs.board import JobBoard
 from arview.station.live.stream.inspection_file import age_notices
@@ -88,7 +88,11 @@ class JobSubject(Subject):
         model = self.part.model
         own = self._board.inspection(self.job, model)
         if own is not None and is_open(state):
-            own = replace(own, components=tuple(one for one in own.components if _has_number(one)))
+            own = replace(
+                own,
+                components=tuple(_provisional(one) for one in own.components if _has_number(one)),
+                provenance=replace(own.provenance, note=sentence("told.inspection_rough")),
+            )
         first = self.job.parent
         if first is None and is_open(state):
             return own
@@ -109,6 +113,13 @@ class JobSubject(Subject):
 def is_open(state: walk.WalkState) -> bool:
     """Whether numbers are still to come."""
     return state.stage in ("collecting", "measuring")
+
+
+def _provisional(component: ComponentDeviation) -> ComponentDeviation:
+    """A component whose number is still to change: measured, not yet compared with its tolerance."""
+    return (
+        component if component.distance_mm is None else replace(component, verdict=Verdict.MEASURED, tolerance_mm=None)
+    )
 
 
 def _has_number(component: ComponentDeviation) -> bool:

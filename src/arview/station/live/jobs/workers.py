@@ -137,19 +137,23 @@ class WorkerQueue:
                 _signal(entry, signal.SIGTERM)
 
         def wait() -> None:
-            ends_s = time.monotonic() + WORKER_STOP_S
-            while time.monotonic() < ends_s and any(map(_is_alive, running)):
-                time.sleep(0.02)
+            _wait_for_end(running)
             for entry in running:
-                if _is_alive(entry):
-                    logger.warning("the measurement of %s did not end in time", entry.job.id)
-                    _signal(entry, signal.SIGKILL)
                 if entry.process is not None:
                     with suppress(subprocess.TimeoutExpired):
                         entry.process.wait(0.5)
                 _forget_pid(entry.job)
 
         return wait
+
+    def stop(self, job: walk.JobFolder) -> None:
+        """End the worker of a job, and wait for it; it is started again when something is asked of it."""
+        with self._lock:
+            running = [one for one in self._entries.values() if one.job.id == job.id and one.is_running]
+            for entry in running:
+                entry.stopping = True
+                _signal(entry, signal.SIGTERM)
+        _wait_for_end(running)
 
     def _may_start(self, entry: _Entry) -> bool:
         if entry.breaks > len(WORKER_PAUSES_S) or time.monotonic() < entry.retry_s:
@@ -246,6 +250,16 @@ def _is_alive(entry: _Entry) -> bool:
     if entry.process is not None:
         return entry.process.poll() is None
     return entry.pid is not None and _is_worker(entry.pid, entry.job)
+
+
+def _wait_for_end(entries: list[_Entry]) -> None:
+    """Wait for workers that were told to end, and end them anyway when they take too long."""
+    ends_s = time.monotonic() + WORKER_STOP_S
+    while time.monotonic() < ends_s and any(map(_is_alive, entries)):
+        time.sleep(0.02)
+    for entry in filter(_is_alive, entries):
+        logger.warning("the measurement of %s did not end in time", entry.job.id)
+        _signal(entry, signal.SIGKILL)
 
 
 def _signal(entry: _Entry, number: signal.Signals) -> None:

@@ -14,10 +14,10 @@ export function retryText({ text, inS }) {
 
 /**
  * The message about what has to be resolved before the page can show anything, or null.
- * @param state {phase, trouble, part} of the page.
- * @param acts {retry, startCamera}
+ * @param state {phase, trouble, part, status} of the page.
+ * @param acts {retry, startCamera, hasPicture: whether a picture has come}
  */
-export function blocking({ phase, trouble, part }, { retry, startCamera }) {
+export function blocking({ phase, trouble, part, status }, { retry, startCamera, hasPicture }) {
   if (phase.name === "busy") {
     return { sign: "busy", title: t("message.busy"), text: t("message.busy.text", { text: phase.text }), button: t("message.try_now"), onPress: retry };
   }
@@ -31,6 +31,9 @@ export function blocking({ phase, trouble, part }, { retry, startCamera }) {
   if (part?.source === "phone" && trouble) {
     return { sign: "camera", title: t("message.no_camera"), text: trouble, button: t("message.try_again"), onPress: startCamera };
   }
+  if (part?.source === "station" && status?.feed?.state === "reconnecting" && !hasPicture) {
+    return { sign: "camera", title: t("message.no_camera"), text: t("message.station_camera"), button: "" };
+  }
   return null;
 }
 
@@ -42,8 +45,9 @@ export function blocking({ phase, trouble, part }, { retry, startCamera }) {
 export function allNotices({ status, part }, { hasGhost, fallback }) {
   const shown = [...(status?.notices ?? [])];
   if (status?.feed && ["reconnecting", "frozen"].includes(status.feed.state) && !shown.some((one) => one.code.startsWith("source_"))) {
-    shown.push({ level: "error", text: status.feed.text });
+    shown.push({ code: `source_${status.feed.state}`, level: "error", text: status.feed.text });
   }
+  for (const [index, one] of shown.entries()) if (one.code?.startsWith("source_")) shown[index] = { ...one, text: t("notice.source", { text: one.text }) };
   const isTold = shown.some((one) => one.code === "inspection_future");
   const inspections = part ? partsOf(part).map((one) => one.inspection).filter(Boolean) : [];
   const ahead = Math.max(0, ...inspections.map(({ created }) => (Date.parse(created) - Date.now()) / 1000), ...inspections.map(({ age_s }) => -age_s));

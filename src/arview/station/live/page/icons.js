@@ -35,6 +35,7 @@ const PATHS = {
   minus: '<path d="M4 12h16" fill="none" stroke="currentColor" stroke-width="2.8"/>',
   fit: '<g fill="none" stroke="currentColor" stroke-width="2.6"><path d="M9 4H4v5M15 4h5v5M20 15v5h-5M9 20H4v-5"/><rect x="9" y="9" width="6" height="6"/></g>',
   follow: '<g fill="none" stroke="currentColor" stroke-width="2.4"><circle cx="12" cy="12" r="6"/><path d="M12 2v5M12 17v5M2 12h5M17 12h5"/></g>',
+  undo: '<path d="M9 4L4 9l5 5M4 9h10a6 6 0 010 12h-4" fill="none" stroke="currentColor" stroke-width="2.6"/>',
   back: '<path d="M15 4l-8 8 8 8" fill="none" stroke="currentColor" stroke-width="2.8"/>',
 };
 

@@ -24,6 +24,7 @@ import { save, share } from "./lists/share.js";
 import { ZoomControls } from "./scene/zoom_controls.js";
 
 const FIGURES_EVERY_MS = 500, STYLE_DELAY_MS = 150, SCREEN_STEP_PX = 16, MAX_DENSITY = 2;
+const FIGURES_KEY = "arview-figures";
 const SILENT_MS = 3000; // the server sends a status every second: after this its figures are old
 const find = (id) => document.getElementById(id);
 
@@ -188,7 +189,7 @@ function refreshState(shown = player?.shown) {
     return bar.show("frozen", ago < 2 ? t("frozen.now") : t("frozen.ago", { seconds: ago }));
   }
   if (phase.name !== "connected") return bar.show(phase.name, retryText(phase));
-  if (part?.source === "phone" && trouble) return bar.show("trouble", trouble);
+  if (part?.source === "phone" && trouble) return bar.show("trouble"); // why, and what to do, is in the message
   if (!player.isAnswered(nowMs)) {
     const words = status?.feed?.text || t(camera.isOn || part?.source !== "phone" ? "why.station" : "why.camera");
     return bar.show("waiting", words);
@@ -206,7 +207,7 @@ function refresh() {
   else bar.show(state.phase.name, retryText(state.phase));
   const { status } = state;
   notices.show(allNotices(state, { hasGhost: stage.hasGhost, fallback: connection.fallback }));
-  message.show(blocking(state, { retry: () => connection.retryNow(), startCamera: () => camera.start(state.part.wanted) }));
+  message.show(blocking(state, { retry: () => connection.retryNow(), startCamera: () => camera.start(state.part.wanted), hasPicture: Boolean(player?.shown?.frame) }));
   const { recording } = status ?? {};
   setPressed("record", Boolean(recording?.is_on), recording?.is_on ? "stop" : "record", recording?.is_on ? clock(recording.seconds) : t("actions.record"));
   if (recording?.is_on) find("record").setAttribute("aria-label", t("actions.record_stop", { time: clock(recording.seconds) }));
@@ -243,11 +244,11 @@ setInterval(() => {
   const nowMs = performance.now();
   state.latencies = state.latencies.filter((one) => nowMs - one.atMs < 2000);
   const sorted = state.latencies.map((one) => one.ms).sort((a, b) => a - b);
-  const pose = player?.shown?.pose;
+  const pose = player?.shown?.pose, isAnswered = state.phase.name === "connected" && player?.isAnswered(nowMs);
   bar.figures({
     quality: pose?.isPosed ? Math.min(...pose.parts.filter((one) => one.cam_from_model).map((one) => one.quality)) : pose?.quality ?? null,
-    latencyMs: sorted.length ? sorted[sorted.length >> 1] : null,
-    ageMs: drawn.frame ? nowMs - drawn.takenMs : null,
+    latencyMs: isAnswered && sorted.length ? sorted[sorted.length >> 1] : null,
+    ageMs: isAnswered && drawn.frame ? nowMs - drawn.takenMs : null,
     staleS: staleFor(nowMs),
   });
   parts.setStale(staleFor(nowMs));
@@ -360,6 +361,20 @@ function toggle(key) {
 }
 
 for (const key of ["ghost", "edges", "labels"]) find(`show-${key}`).addEventListener("click", () => toggle(key));
+/** The figures that only engineers need, such as the delay, are shown where they have switched them on. */
+function showFigures(isOn) {
+  document.body.classList.toggle("has-figures", isOn);
+  find("show-figures").setAttribute("aria-checked", String(isOn));
+}
+
+find("show-figures").addEventListener("click", () => {
+  const isOn = !document.body.classList.contains("has-figures");
+  showFigures(isOn);
+  try {
+    localStorage.setItem(FIGURES_KEY, String(isOn));
+  } catch { /* without storage the choice lasts until the page is closed */ }
+});
+showFigures(localStorage.getItem(FIGURES_KEY) === "true");
 find("opacity").addEventListener("input", (event) => {
   style.opacity = Number(event.target.value);
   find("opacity-text").textContent = `${Math.round(100 * style.opacity)} %`;

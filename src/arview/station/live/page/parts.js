@@ -6,7 +6,7 @@ import { spanText } from "./status.js";
 import { t } from "./texts/texts.js";
 
 const ORDER = ["fail", "undecided", "not_measured", "measured", "pass"];
-const COMPLETENESS = { COMPLETE: "pass", INCOMPLETE: "fail", "NOT YET CHECKED": "undecided" };
+const COMPLETENESS = { COMPLETE: "none", INCOMPLETE: "fail", "NOT YET CHECKED": "none" }; // seen is not yet judged
 
 /** An age as text, such as "3 h ago", in the largest unit of which there are at least two. */
 export function ageText(seconds) {
@@ -208,7 +208,7 @@ class PartList {
     ]);
     const axes = one.displacement_mm.map((value, k) => {
       const text = value === null ? "?" : `${value < 0 ? "−" : "+"}${rounded(Math.abs(value), u)}`;
-      return make("span", value !== null && Math.abs(value) <= u ? "small" : "", [`d${"xyz"[k]} ${text}`]);
+      return make("span", value !== null && Math.abs(value) <= u ? "small" : "", [`d${"xyz"[k]}\u00a0${text}`]);
     });
     const turn = one.detail_text.split("   ").filter((text) => text.startsWith("tilt") || text.startsWith("twist"));
     return [head, numbers, ...remark, ...gauge(one), make("p", "axes", [...axes, ...turn.map((text) => make("span", "", [text]))])];

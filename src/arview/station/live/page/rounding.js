@@ -1,5 +1,7 @@
 // Numbers with the decimals that their uncertainty allows, as in arview.inspection.rounding: U has two significant digits.
 
+import { decimal } from "./texts/texts.js";
+
 const MAX_DECIMALS = 6, EXACT_DECIMALS = 4;
 
 /** Number of decimals of a value with this expanded uncertainty. */
@@ -9,7 +11,9 @@ export function decimalsOf(u) {
 }
 
 /** A measured value, or U itself. */
-export const rounded = (value, u) => value.toFixed(u > 0 ? decimalsOf(u) : 2);
+export const rounded = (value, u) => decimal(value.toFixed(u > 0 ? decimalsOf(u) : 2));
 
 /** An exact number such as a tolerance, without the noise of binary fractions. */
-export const exact = (value) => String(Number(value.toFixed(EXACT_DECIMALS)));
+export const exact = (value) => decimal(String(Number(value.toFixed(EXACT_DECIMALS))));
+
+export { decimal };

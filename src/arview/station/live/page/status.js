@@ -15,7 +15,8 @@ const STRONG = {
 };
 const RANKS = { error: 0, warning: 1, info: 2 };
 
-const capitalized = (text) => text.charAt(0).toUpperCase() + text.slice(1);
+/** A sentence with a capital at its beginning, unless it begins with a name such as post_1. */
+const capitalized = (text) => (/^[^\s,;:]*[_\d]/.test(text) ? text : text.charAt(0).toUpperCase() + text.slice(1));
 
 /** A duration as text, such as "12 s", in the largest unit of which there are at least two. */
 export function spanText(seconds) {

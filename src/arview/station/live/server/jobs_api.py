@@ -7,7 +7,7 @@ import hashlib
 from collections import OrderedDict
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar, get_args
+from typing import Any, Literal, TypeVar, get_args
 
 from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, Response
@@ -86,6 +86,7 @@ class JobHandlers:
             Route(f"{job}/inspection.json", self.inspection),
             Route(f"{job}/decisions.csv", self.decisions),
             Route(f"{job}/photos/{{name:path}}", self.photo),
+            Route(f"{job}/photos/{{name}}", self.take_back, methods=["DELETE"]),
             Route(f"{job}/rework/{{component}}.svg", self.drawing),
             Route(f"{job}/rework/{{picture:path}}", self.picture),
         ]
@@ -135,8 +136,7 @@ class JobHandlers:
     async def reopen(self, request: Request) -> Response:
         """More photos come after all."""
         job = await self._job(request)
-        await self._stored(lambda: job.reopen())
-        await asyncio.to_thread(self._desk.changed, job)
+        await self._stored(lambda: self._desk.reopen(job))
         return await self._document(job)
 
     async def recheck(self, request: Request) -> Response:
@@ -167,12 +167,8 @@ class JobHandlers:
         answer = await asyncio.to_thread(self._desk.board.uploads(job).state, name)
         if isinstance(answer, Upload):
             return JSONResponse({"offset": answer.offset})
-        if quality.is_attachment(answer):
-            path = await asyncio.to_thread(_photo_file, job, answer)
-            return JSONResponse({"photo": answer, "offset": 0 if path is None else path.stat().st_size})
-        photos = await asyncio.to_thread(job.photos)
-        size = next((photo.bytes for photo in photos if photo.name == answer), 0)
-        return JSONResponse({"photo": answer, "offset": size})
+        path = await asyncio.to_thread(_photo_file, job, answer)
+        return JSONResponse({"photo": answer, "offset": 0 if path is None else path.stat().st_size})
 
     async def add_piece(self, request: Request) -> Response:
         """Take a piece of a photo; the last one is answered when the photo is on the disk."""
@@ -223,6 +219,15 @@ class JobHandlers:
             return photo
 
         return JSONResponse({"photo": await asyncio.to_thread(store)}, 201)
+
+    async def take_back(self, request: Request) -> Response:
+        """Take a photo back, until the walk has ended."""
+        job = await self._job(request)
+        name, why = request.path_params["name"], request.query_params.get("why", "unwanted")[:40]
+        await self._stored(lambda: job.take_back(name, why))
+        await asyncio.to_thread(self._desk.lost, job)
+        await asyncio.to_thread(self._desk.changed, job)
+        return await self._document(job)
 
     async def photo(self, request: Request) -> Response:
         """A photo as it was received."""
@@ -293,9 +298,10 @@ class JobHandlers:
         if part is None or inspection is None or inspection.find(request.path_params["component"]) is None:
             raise Refusal(404, "not_found", "there is no such component here")
         component = request.path_params["component"]
-        key = job.id, component, (job.path / "inspection.json").stat().st_mtime_ns
+        form: Literal["sheet", "screen"] = "screen" if "screen" in request.query_params else "sheet"
+        key = job.id, f"{form} {component}", (job.path / "inspection.json").stat().st_mtime_ns
         if key not in self._drawings:
-            self._drawings[key] = await self._stored(lambda: drawing_svg(part, inspection, component))
+            self._drawings[key] = await self._stored(lambda: drawing_svg(part, inspection, component, form))
             while len(self._drawings) > KEPT_DRAWINGS:
                 self._drawings.popitem(last=False)
         headers = {"Content-Security-Policy": DRAWING_POLICY}

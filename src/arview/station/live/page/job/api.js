@@ -14,6 +14,9 @@ export const listJobs = async () => (await get("/api/jobs")).jobs;
 export const openJob = (part, serial) => post("/api/jobs", { part, serial });
 export const getJob = (id) => get(at(id));
 export const getCells = (id) => get(at(id, "/capture"));
+export const reopenJob = (id) => post(at(id, "/reopen"), {});
+/** Take a photo back; `why` is "unwanted" or "blurred". Returns the job without it. */
+export const takeBack = async (id, name, why) => translated(await (await ask(at(id, `/photos/${encodeURIComponent(name)}?why=${why}`), { method: "DELETE" })).json());
 export const endJob = (id) => post(at(id, "/end"), {});
 export const recheckJob = (id, components) => post(at(id, "/recheck"), { components });
 export const takeAtStation = (id, client, purpose = "measure") => post(at(id, "/take"), { client, purpose });

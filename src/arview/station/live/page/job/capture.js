@@ -8,7 +8,7 @@ import { Motion } from "./motion.js";
 import { Needs } from "./needs.js";
 import { asJpeg, takePhoto } from "./photo.js";
 import { allowSound, signal } from "./signals.js";
-import { counts, verdictWord } from "./verdicts.js";
+import { Taken } from "./taken.js";
 
 const RETRY_MS = 3000; // a photo that could not be taken is asked for again after this time
 const CELLS_EVERY_MS = 1500;
@@ -25,7 +25,7 @@ export class CaptureView {
 
   /**
    * @param host of the page. @param queue of the uploads.
-   * @param events {onEnd(): all photos are taken, onLeave(), onTrouble(text)}
+   * @param events {onEnd(): all photos are taken, onLeave(), onTrouble(text), onJob(job): it has changed}
    */
   constructor(host, queue, events) {
     Object.assign(this, { host, queue, events });
@@ -33,6 +33,7 @@ export class CaptureView {
     this.dome = new Dome();
     this.motion = new Motion((rate) => host.connection.link?.tell({ type: "motion", gyro_rad_s: rate }));
     this.#build();
+    this.hasCells = false;
     this.needs = new Needs(host.layer, (part, point) => host.stage.toScreen(part, point));
   }
 
@@ -48,6 +49,7 @@ export class CaptureView {
     this.text = make("strong", "hud-text", [], { "aria-live": "polite" });
     this.reason = make("span", "hud-reason");
     this.first = make("div", "hud-first", [], { "aria-live": "polite" });
+    this.taken = new Taken(this.queue, { onTrouble: (text) => this.events.onTrouble(text), onChange: (job) => (job ? this.events.onJob(job) : this.refresh()) });
     this.bar = make("i");
     this.meter = make("div", "hud-meter", [this.bar], { role: "progressbar", "aria-valuemin": "0", "aria-valuemax": "100", "aria-label": t("job.progress") });
     this.count = make("b", "hud-count");
@@ -67,6 +69,7 @@ export class CaptureView {
       this.dome.element,
       this.shutter,
       make("div", "hud-figures", [this.count, this.state]),
+      this.taken.element,
       make("div", "hud-buttons", [this.leave, this.pick, this.done]),
       this.files,
     ], { id: "job-hud", role: "region", "aria-label": t("job.capture") });
@@ -87,7 +90,7 @@ export class CaptureView {
     Object.assign(this, { job, part });
     this.#lastTake = this.#advice = null;
     this.#wasEnough = false;
-    this.wanted = null;
+    this.hasCells = false;
     this.#cellsMs = -Infinity;
     this.needs.setComponents(document.components, part);
     this.element.hidden = false;
@@ -103,7 +106,7 @@ export class CaptureView {
     this.#cellsMs = nowMs;
     const cells = await getCells(job.id).catch(() => null);
     if (this.job?.id !== job.id || !cells?.cells) return;
-    this.wanted = cells.wanted_photos;
+    this.hasCells = true;
     this.dome.setGeometry(cells, this.center);
     this.#draw();
   }
@@ -142,7 +145,7 @@ export class CaptureView {
   refresh(job = this.job) {
     if (!job) return;
     this.job = job;
-    if (this.wanted === null) this.#getCells();
+    if (!this.hasCells) this.#getCells();
     this.#draw();
   }
 
@@ -162,7 +165,7 @@ export class CaptureView {
         const taken = new Date().toISOString(), hint = this.#hint(pose);
         const photo = await takePhoto(this.host.camera.track, this.host.camera.video);
         signal("taken");
-        await this.queue.add(job.id, photo.blob, { source: photo.source, taken, hint });
+        this.taken.keep(photo.blob, await this.queue.add(job.id, photo.blob, { source: photo.source, taken, hint }));
       } else {
         await takeAtStation(job.id, this.host.connection.link?.client ?? "");
         signal("taken");
@@ -190,7 +193,7 @@ export class CaptureView {
     const { job } = this;
     for (const file of this.files.files) {
       const jpeg = await asJpeg(file).catch(() => null);
-      if (jpeg) await this.queue.add(job.id, jpeg, { source: "upload", taken: new Date(file.lastModified || Date.now()).toISOString(), hint: null });
+      if (jpeg) this.taken.keep(jpeg, await this.queue.add(job.id, jpeg, { source: "upload", taken: new Date(file.lastModified || Date.now()).toISOString(), hint: null }));
       else this.events.onTrouble(t("job.not_jpeg", { name: file.name }));
     }
     this.files.value = "";
@@ -207,7 +210,8 @@ export class CaptureView {
     const share = Math.round(100 * (advice?.progress ?? 0));
     this.bar.style.width = `${share}%`;
     this.meter.setAttribute("aria-valuenow", String(share));
-    put(this.count, this.wanted >= stored + waiting ? t("job.photos_of", { photos: stored + waiting, wanted: this.wanted }) : t("job.photos", { photos: stored + waiting }));
+    put(this.count, t(stored + waiting === 1 ? "job.photos_one" : "job.photos_count", { photos: stored + waiting }));
+    this.taken.show(job);
     put(this.state, this.#stateText(waiting, stored));
     this.state.classList.toggle("bad", Boolean(queue.trouble) || queue.refused(job.id).length > 0);
     this.element.classList.toggle("is-enough", isEnough);
@@ -218,13 +222,11 @@ export class CaptureView {
     if (advice) this.dome.update(advice.cells, isTracked ? (this.#pose.parts?.[this.part] ?? this.#pose).cam_from_model : null);
   }
 
-  /** The first numbers, as counts of verdicts. */
+  /** How many components have a first number; none is a verdict yet. */
   #drawFirst(inspection) {
-    const found = inspection ? counts(inspection.components) : [], key = found.join();
-    if (key === this.firstKey) return;
-    this.firstKey = key;
-    const list = found.map(([kind, count]) => make("span", `count ${kind}`, [icon(kind), `${count} ${verdictWord(kind)}`]));
-    this.first.replaceChildren(...(list.length ? [make("b", "", [t("job.first_numbers")]), ...list] : []));
+    const all = inspection?.components ?? [], count = all.filter((one) => one.distance_mm !== null).length;
+    const text = count ? t("job.first_numbers", { count, all: all.length }) : "";
+    if (this.first.textContent !== text) this.first.textContent = text;
   }
 
   #stateText(waiting, stored) {

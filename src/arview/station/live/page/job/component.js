@@ -1,12 +1,15 @@
 // One component of a result: how to put it right, with drawing and steps; the check again; the decision.
 
 import { icon, make } from "../icons.js";
-import { t } from "../texts/texts.js";
+import { exact, rounded } from "../rounding.js";
+import { hasText, t } from "../texts/texts.js";
 import { fileOf } from "./api.js";
+import { Drawing } from "./drawing.js";
 import { DecisionPhoto, titleOf } from "./decision_photo.js";
-import { latestDecisions } from "./results.js";
+import { isOpen, latestDecisions } from "./results.js";
 import { verdictWord } from "./verdicts.js";
 
+const MIN_TURN_DEG = 0.1; // smaller turns are not told
 const REASONS = ["job.reason.reworked", "job.reason.accepted", "job.reason.no_function", "job.reason.scrap", "job.reason.other"];
 
 /** Name of the person, remembered on this device. */
@@ -15,10 +18,13 @@ export const person = {
   set: (name) => localStorage.setItem("arview-person", name),
 };
 
+/** The name of the person, or of who worked on this job last; empty where nobody has. */
+const nameFor = (job) => person.get() || ((job.decisions ?? []).findLast((one) => one.by)?.by ?? "");
+
 /** A field for the name of the person who decides. */
-export function personField(id) {
+export function personField(id, name = person.get()) {
   const input = make("input", "", [], { id, type: "text", autocomplete: "name", maxlength: "80", required: "" });
-  input.value = person.get();
+  input.value = name;
   return { input, field: make("label", "job-field", [make("span", "", [t("job.by")]), input], { for: id }) };
 }
 
@@ -45,7 +51,7 @@ export class ComponentView {
     const ticks = stepsDone(job.decisions, name);
     const isDone = job.state.stage === "done";
     this.#update("decision", [job.id, name, decision, isDone], () => (isDone ? this.#decision(job, name, decision) : []));
-    this.#update("result", [job.id, name, component, instruction, [...ticks], isDone], () => this.#result(job, component, instruction, ticks));
+    this.#update("result", [job.id, name, component, instruction, [...ticks], isDone, isOpen(job)], () => this.#result(job, component, instruction, ticks));
   }
 
   /** Make one half of the view again if what it shows has changed: what is typed in the other half stays. */
@@ -57,45 +63,47 @@ export class ComponentView {
   }
 
   #result(job, component, instruction, ticks) {
-    const { name } = component;
+    const { name } = component, isRough = isOpen(job);
     const back = make("button", "job-back", [icon("back"), t("job.back_to_result")]);
     back.addEventListener("click", () => this.events.onBack());
     return [
       make("div", "job-head", [back, make("h3", "", [name])]),
-      make("div", `job-banner ${component.verdict}`, [
-        make("div", "what", [icon(component.verdict), make("b", "", [verdictWord(component.verdict)]), make("b", "big", [component.value_text])]),
-        make("p", "", [component.detail_text ?? ""]),
+      make("div", `job-banner ${isRough ? "rough" : component.verdict}`, [
+        make("div", "what", [icon(isRough ? "busy" : component.verdict), make("b", "", [isRough ? t("job.provisional") : verdictWord(component.verdict)]), make("b", "big", [component.value_text])]),
+        make("p", "numbers-of", numbersOf(component).map((text) => make("span", "", [text]))),
       ]),
       ...(instruction ? this.#rework(job, name, instruction, ticks) : []),
     ];
   }
 
   #rework(job, name, { moves = [], turn, text = "", place = "", steps = [], remark, pictures = [], how }, ticks) {
-    const title = make("h3", "", [t("job.rework"), ...(how ? [make("small", "", [how])] : [])]);
-    const list = moves.map((one) => make("li", "move", [icon("displaced"), make("b", "", [one.text])]));
-    if (turn) list.push(make("li", "move", [icon("displaced"), make("b", "", [typeof turn === "string" ? turn : turn.text])]));
-    const drawing = make("img", "job-drawing", [], { src: fileOf(job.id, `rework/${name}.svg`), alt: t("job.drawing", { name }) });
-    drawing.addEventListener("error", () => { drawing.hidden = true; });
-    const who = personField("job-tick-by");
-    who.field.hidden = Boolean(person.get());
+    const title = make("h3", "", [t("job.rework"), ...(how ? [make("small", "", [hasText(`job.how.${how}`) ? t(`job.how.${how}`) : how])] : [])]);
+    // Each instruction once: the moves are said in the steps; only where they are not, they stand by themselves.
+    const told = [...moves, ...(turn ? [typeof turn === "string" ? { text: turn } : turn] : [])].map((one) => one.text);
+    const isMove = (step) => told.some((one) => step.toLowerCase().includes(one.toLowerCase()));
+    const list = steps.some(isMove) ? [] : told.map((one) => make("li", "move", [icon("displaced"), make("b", "", [one])]));
+    const drawing = new Drawing(job.id, name);
+    const who = personField("job-tick-by", nameFor(job));
+    who.input.addEventListener("change", () => { if (who.input.value.trim()) person.set(who.input.value.trim()); });
     const boxes = steps.map((text, step) => {
       const box = make("input", "", [], { type: "checkbox", id: `job-step-${step}` });
       box.checked = ticks.has(step);
       box.addEventListener("change", () => {
         if (who.input.value.trim()) person.set(who.input.value.trim());
-        if (person.get()) return this.events.onTick(name, step, box.checked);
+        if (who.input.value.trim()) return this.events.onTick(name, step, box.checked);
         box.checked = !box.checked;
         this.events.onTrouble(t("job.name_needed"));
         who.input.focus();
       });
-      return make("li", "", [make("label", "", [box, make("span", "", [text])], { for: `job-step-${step}` })]);
+      return make("li", "", [make("label", "", [box, make("span", `${isMove(text) ? "move" : ""} ${isLower(text, name) ? "first-up" : ""}`, [text])], { for: `job-step-${step}` })]);
     });
     const more = pictures.map((picture) => make("img", "job-drawing", [], { src: fileOf(job.id, `rework/${picture}`), alt: "" }));
     const again = make("button", "wide primary", [icon("camera"), t("job.check_again")]);
     again.addEventListener("click", () => this.events.onRecheck(name));
     return [
-      title, ...[text, place].filter(Boolean).map((one) => make("p", "", [one])), make("ul", "job-moves", list), ...(remark ? [make("p", "job-remark", [icon("warning"), remark])] : []), drawing, ...more,
-      ...(boxes.length ? [who.field, make("ol", "job-steps", boxes)] : []), ...(job.state.stage === "done" ? [again] : []),
+      title, ...[text, steps.some((one) => place && one.includes(place)) ? "" : place].filter(Boolean).map((one) => make("p", "first-up", [one])),
+      ...(list.length ? [make("ul", "job-moves", list)] : []), ...(remark ? [make("p", "job-remark", [icon("warning"), remark])] : []),
+      ...(boxes.length ? [make("ol", "job-steps", boxes), who.field] : []), drawing.element, ...more, ...(job.state.stage === "done" ? [again] : []),
     ];
   }
 
@@ -123,7 +131,7 @@ export class ComponentView {
     const reason = make("input", "", [], { id: "job-reason", type: "text", list: "job-reasons", maxlength: "200" });
     const reasons = make("datalist", "", REASONS.map((key) => make("option", "", [], { value: t(key) })), { id: "job-reasons" });
     const note = make("textarea", "", [], { id: "job-note", rows: "2", maxlength: "2000" });
-    const { input: by, field } = personField("job-by");
+    const { input: by, field } = personField("job-by", nameFor(job));
     this.photo?.close();
     const photo = (this.photo = new DecisionPhoto(job, this.queue, this.host, this.events.onTrouble));
     const save = make("button", "wide primary", [t("job.save_decision")], { type: "submit" });
@@ -153,6 +161,21 @@ export class ComponentView {
   }
 }
 
+/** What was measured of a component, each number with its name: tolerance, displacement by axes, turns, U. */
+function numbersOf({ tolerance_mm: tolerance, displacement_mm: moved, tilt_deg: tilt, twist_deg: twist, uncertainty_mm: u, detail_text: text }) {
+  if (!moved) return text ? [text] : [];
+  const signed = (value) => `${value < 0 ? "−" : "+"}${rounded(Math.abs(value), u ?? 0)}`;
+  return [
+    ...(tolerance ? [t("card.tolerance", { tolerance: exact(tolerance) })] : []), ...(u === null ? [] : [t("card.u", { u: rounded(u, u) })]),
+    ...moved.map((value, k) => `d${"xyz"[k]}\u00a0${value === null ? "?" : signed(value)}`),
+    ...(Math.abs(tilt ?? 0) >= MIN_TURN_DEG ? [t("card.tilt", { angle: exact(Number(tilt.toFixed(1))) })] : []),
+    ...(Math.abs(twist ?? 0) >= MIN_TURN_DEG ? [t("card.twist", { angle: exact(Number(twist.toFixed(1))) })] : []),
+  ];
+}
+
+/** Whether a sentence begins with a small letter that is not that of a name. */
+const isLower = (text, name) => /^\p{Ll}/u.test(text) && !text.startsWith(name);
+
 /** Steps of a component that are ticked: the newest tick of each step counts. */
 function stepsDone(entries, name) {
   const done = new Set();
@@ -168,7 +191,7 @@ function stepsDone(entries, name) {
 export function signForm(job, { onSign, onBack, onTrouble }) {
   const failing = (job.inspection?.components ?? []).filter((one) => ["fail", "undecided", "not_measured"].includes(one.verdict));
   const decided = latestDecisions(job.decisions), open = failing.filter((one) => !decided.has(one.name));
-  const { input: by, field } = personField("job-sign-by");
+  const { input: by, field } = personField("job-sign-by", nameFor(job));
   const note = make("textarea", "", [], { id: "job-sign-note", rows: "2", maxlength: "2000" });
   const back = make("button", "job-back", [icon("back"), t("job.back_to_result")], { type: "button" });
   back.addEventListener("click", onBack);

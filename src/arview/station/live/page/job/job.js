@@ -1,6 +1,7 @@
 // The inspection as a job on the page: start, guided capture, result, rework, check again, decisions, signature. What is
 // confirmed is at the station; this page only remembers which job it is in.
 
+import { confirmed } from "../confirm.js";
 import { icon, make } from "../icons.js";
 import { partsOf } from "../transport/api.js";
 import { t } from "../texts/texts.js";
@@ -42,11 +43,12 @@ class JobPage {
     const trouble = (text) => host.toast.show(text);
     this.capture = new CaptureView(hostOf(host, document.getElementById("job-layer")), this.queue, {
       onEnd: () => this.#end(), onTaken: () => this.#endWhenStored(), onLeave: () => this.#leave(), onTrouble: trouble,
+      onJob: (job) => this.#take(job),
     });
     this.start = new StartView(host, { onStart: (part, serial) => this.#begin(part, serial), onOpen: (id) => this.#open(id) });
     this.results = new ResultsView({
-      onComponent: (name) => this.#show("component", name), onMore: () => this.#show("capture"), onSign: () => this.#show("sign"),
-      onBack: () => this.#back(), onRecheck: (id) => this.#open(id),
+      onComponent: (name) => this.#show("component", name), onMore: () => this.#reopen(), onSign: () => this.#show("sign"),
+      onBack: () => this.#back(), onRecheck: (id) => this.#open(id), onCancel: () => this.#cancel(),
     });
     this.component = new ComponentView(this.queue, host, {
       onBack: () => this.#show("results"), onTrouble: trouble,
@@ -136,6 +138,28 @@ class JobPage {
     } finally {
       this.isEndAsked = false;
     }
+  }
+
+  /** End the measurement, after a question: photos can be taken and taken back again, and it can be measured anew. */
+  async #cancel() {
+    const isSure = await confirmed({ title: t("job.cancel_title"), text: t("job.cancel_text"), yes: t("job.cancel_sure"), no: t("job.cancel_not") });
+    if (isSure) await this.#reopen();
+  }
+
+  /** Go on to take photos of a job that was ended. */
+  #reopen() {
+    localStorage.removeItem(ENDING_KEY);
+    return this.#act(async () => {
+      this.#take(this.job.is_ended || this.job.state.stage !== "collecting" ? await api.reopenJob(this.job.id) : this.job);
+      this.#show("capture");
+    });
+  }
+
+  /** Take over the job as the station has it now. */
+  #take(job) {
+    if (this.job?.id !== job.id) return;
+    this.job = job;
+    this.#draw();
   }
 
   #leave() {

@@ -28,7 +28,7 @@ export class Needs {
     for (const { index, photos, is_enough: isEnough, text } of needs) {
       const sign = this.#signs.get(index) ?? this.#add(index);
       sign.className = `need ${isEnough ? "enough" : photos ? "some" : "none"}`;
-      const words = isEnough ? "✓" : String(photos);
+      const words = String(photos);
       if (sign.firstChild.textContent !== words) sign.firstChild.textContent = words;
       sign.title = text || t("job.need", { name: this.#components[index]?.name ?? "", photos });
     }

@@ -1,7 +1,7 @@
 // The queue of photos on their way to the station: in order, in pieces, again after every failure, until the station has
 // confirmed each one.
 
-import { beginUpload, getOffset, sendPiece } from "./api.js";
+import { beginUpload, getOffset, sendPiece, takeBack } from "./api.js";
 import { sha256 } from "./hash.js";
 import { openStore } from "./store.js";
 
@@ -29,7 +29,12 @@ export class UploadQueue {
 
   /** Photos of a job that are to be measured and that the station has not confirmed yet. */
   waiting(job) {
-    return this.#entries.filter((one) => one.job === job && one.purpose !== "decide" && !one.refused).length;
+    return this.entries(job).length;
+  }
+
+  /** Photos of a job on their way, oldest first. */
+  entries(job) {
+    return this.#entries.filter((one) => one.job === job && one.purpose !== "decide" && !one.refused);
   }
 
   /** Photos of a job that the station will not take, with why. */
@@ -40,7 +45,7 @@ export class UploadQueue {
   /**
    * Add a photo; resolves when it is kept on this device.
    * @param purpose "measure", or "decide" for one that shows a decision.
-   * @returns {stored}: promise of its name, once the station has confirmed it.
+   * @returns {stored, sha256}: promise of its name, once the station has confirmed it; and its hash.
    */
   async add(job, blob, { source, taken, hint, purpose = "measure" }) {
     await this.isReady;
@@ -52,11 +57,12 @@ export class UploadQueue {
     stored.catch(() => {}); // a refusal is told by onRefused as well
     this.events.onChange();
     this.#run();
-    return { stored };
+    return { stored, sha256: entry.sha256 };
   }
 
-  /** Forget a photo that the station does not take. */
-  async drop(entry) {
+  /** Forget a photo that is on its way; it is taken back if it arrives all the same. */
+  async drop(entry, why) {
+    entry.dropped = why;
     await this.#remove(entry);
   }
 
@@ -97,6 +103,7 @@ export class UploadQueue {
       try {
         const name = await this.#send(entry);
         this.#say("");
+        if (entry.dropped) await takeBack(entry.job, name, entry.dropped);
         await this.#remove(entry); // only now: the station has confirmed it
         this.#awaited.get(entry.key)?.resolve(name);
         this.#awaited.delete(entry.key);
@@ -104,6 +111,7 @@ export class UploadQueue {
         [pauseMs, badHashes] = [FIRST_PAUSE_MS, 0];
       } catch (error) {
         if (error.code === undefined) throw error;
+        if (entry.dropped) continue;
         if (error.code === "bad_hash" && ++badHashes < MAX_BAD_HASHES) {
           entry.upload = null;
           continue;
@@ -134,7 +142,7 @@ export class UploadQueue {
       });
       if (begun.photo) return begun.photo;
       [entry.upload, offset] = [begun.upload, begun.offset];
-      await this.store.update(entry);
+      if (!entry.dropped) await this.store.update(entry);
     }
     for (;;) {
       this.sent = offset;

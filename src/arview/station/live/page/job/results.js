@@ -1,10 +1,11 @@
 // The result of a job: measuring, first numbers, final; verdicts of the components; what people decided; the signature.
 
 import { icon, make } from "../icons.js";
-import { rounded } from "../rounding.js";
+import { decimal, rounded } from "../rounding.js";
 import { language, t } from "../texts/texts.js";
 import { fileOf } from "./api.js";
-import { bySeverity, counts, verdictSign, verdictWord } from "./verdicts.js";
+import { leftText, shareDone } from "./time_left.js";
+import { bySeverity, counts, verdictWord } from "./verdicts.js";
 
 /** The newest decision about each component: name → decision. */
 export function latestDecisions(decisions) {
@@ -18,10 +19,12 @@ const when = (text) => new Date(text).toLocaleString([], { dateStyle: "short", t
 export class ResultsView {
   #key = "";
 
-  /** @param events {onComponent(name), onMore(), onSign(), onRecheck(id), onBack(), onEnd()} */
+  /** @param events {onComponent(name), onMore(), onSign(), onRecheck(id), onBack(), onCancel()} */
   constructor(events) {
     this.events = events;
     this.element = make("div", "job-view");
+    this.bar = make("progress", "", [], { max: "100", "aria-label": t("job.measuring") });
+    this.left = make("p", "job-quiet");
   }
 
   /**
@@ -29,14 +32,14 @@ export class ResultsView {
    * `waiting` photos are still on this device.
    */
   show(job, { rechecks = [], waiting = 0, parent = null } = {}) {
-    const key = JSON.stringify([job, rechecks, waiting]);
+    const { state, inspection } = job, { measuring_s: _, expected_s: __, ...known } = job;
+    this.#tell(job);
+    const key = JSON.stringify([{ ...known, state: { ...state, step: "", done: 0, total: 0, updated: "" } }, rechecks, waiting]);
     if (key === this.#key) return;
     this.#key = key;
-    const { state, inspection } = job;
     const inside = [this.#head(job, parent), this.#progress(job, waiting)];
-    if (inspection) inside.push(this.#banner(job));
     if (parent) inside.push(...this.#beforeAfter(job));
-    else if (inspection) inside.push(this.#components(job, rechecks));
+    else if (inspection) inside.push(this.#banner(job), this.#components(job, rechecks));
     if (state.stage === "done") inside.push(...(parent ? this.#checked(parent) : this.#end(job)));
     inside.push(this.#photos(job));
     const { scrollTop } = this.element.parentElement ?? {};
@@ -51,7 +54,7 @@ export class ResultsView {
   }
 
   /** What is being done, with its share; nothing when all is done. */
-  #progress({ state }, waiting) {
+  #progress({ state, photos }, waiting) {
     if (state.stage === "done") {
       const cloud = { waiting: "job.cloud_running", running: "job.cloud_running", failed: "job.cloud_failed" }[state.cloud];
       return cloud ? make("p", "job-quiet", [t(cloud)]) : null;
@@ -61,35 +64,42 @@ export class ResultsView {
       more.addEventListener("click", () => this.events.onMore());
       return make("div", "job-progress failed", [make("p", "", [icon("error"), state.text || t("job.failed")]), ...original(state), more], { role: "alert" });
     }
-    const total = state.total || 0, share = total ? Math.min(100, Math.round((100 * state.done) / total)) : null;
-    const bar = make("progress", "", [], { max: "100", "aria-label": t("job.measuring") });
-    if (share !== null) bar.value = share;
-    const lines = waiting ? t("job.sending", { waiting }) : state.text || t("job.measuring");
-    const placed = state.placed ? t("job.placed", { placed: state.placed, photos: state.photos }) : "";
-    return make("div", "job-progress", [make("p", "", [icon("busy"), lines]), bar, make("p", "job-quiet", [placed])], { role: "status" });
+    const cancel = make("button", "wide", [icon("stop"), t("job.cancel")]);
+    cancel.addEventListener("click", () => this.events.onCancel());
+    const words = waiting ? t("job.sending", { waiting }) : t("job.measuring_of", { photos: t(photos.length === 1 ? "job.photos_one" : "job.photos_count", { photos: photos.length }) });
+    return make("div", "job-progress", [make("p", "", [icon("busy"), make("b", "", [words])]), this.bar, this.left, cancel], { role: "status" });
   }
 
-  #banner({ state, inspection, components: checked }) {
-    // A check again is about its own components only.
-    const components = inspection.components.filter((one) => !checked || checked.includes(one.name));
-    const verdict = checked ? bySeverity(components)[0]?.verdict : inspection.verdict, sentence = checked ? "" : language === "en" ? inspection.sentence : t("job.sentence", { count: components.length });
-    const isRough = Boolean(state.is_rough) || state.stage !== "done";
+  /** How far the measurement is, and the time left; often told anew, without drawing all again. */
+  #tell(job) {
+    const share = shareDone(job.state), text = job.is_ended ? leftText(job) : "";
+    if (share === null) this.bar.removeAttribute("value");
+    else this.bar.value = Math.max(this.bar.value ?? 0, Math.round(100 * share));
+    if (this.left.textContent !== text) this.left.textContent = text;
+  }
+
+  #banner(job) {
+    const { components, verdict, sentence } = job.inspection;
+    if (isOpen(job)) {
+      return make("div", "job-banner rough", [make("div", "what", [icon("busy"), make("b", "", [t("job.provisional")])]), make("p", "", [t("job.rough")])], { role: "status" });
+    }
     const list = counts(components).map(([kind, count]) => make("span", `count ${kind}`, [icon(kind), `${count} ${verdictWord(kind)}`]));
-    const words = [make("b", "", [isRough ? t("job.provisional") : verdictWord(verdict)])];
-    return make("div", `job-banner ${isRough ? "rough" : verdict}`, [
-      make("div", "what", [isRough ? icon("busy") : icon(verdict), ...words]),
-      ...(isRough || sentence ? [make("p", "", [isRough ? t("job.rough") : sentence])] : []), make("div", "tally", list),
+    return make("div", `job-banner ${verdict}`, [
+      make("div", "what", [icon(verdict), make("b", "", [verdictWord(verdict)])]),
+      make("p", "", [language === "en" ? sentence : t("job.sentence", { count: components.length })]), make("div", "tally", list),
     ], { role: "status" });
   }
 
   #components(job, rechecks) {
     const decided = latestDecisions(job.decisions), again = new Map();
     for (const one of rechecks) for (const row of one.before_after ?? []) again.set(row.name, { ...row, stage: one.state.stage });
-    const rows = bySeverity(job.inspection.components).map((one) => {
-      const row = make("button", `component ${one.verdict}`, [
-        icon(one.verdict), make("span", "name", [one.name]),
+    const isRough = isOpen(job), found = job.inspection.components;
+    const rows = (isRough ? found : bySeverity(found)).map((one) => {
+      const kind = isRough ? "none" : one.verdict;
+      const row = make("button", `component ${kind}`, [
+        icon(kind), make("span", "name", [one.name]),
         make("span", "value", [one.value_text, ...(one.uncertainty_mm === null ? [] : [make("small", "", [`U ${rounded(one.uncertainty_mm, one.uncertainty_mm)}`])])]),
-        make("span", "verdict", [verdictWord(one.verdict)]), ...remarks(one, decided.get(one.name), again.get(one.name)),
+        make("span", "verdict", [isRough ? t("job.provisional_word") : verdictWord(kind)]), ...remarks(one, decided.get(one.name), again.get(one.name)),
       ]);
       row.dataset.name = one.name;
       row.addEventListener("click", () => this.events.onComponent(one.name));
@@ -98,12 +108,14 @@ export class ResultsView {
     return make("ul", "components", rows);
   }
 
+  /** The components of a check after rework: each with its new verdict first, then what it was before and is now. */
   #beforeAfter(job) {
-    const rows = (job.before_after ?? []).map((one) => make("div", `before-after ${one.verdict_after ?? "none"}`, [
-      make("b", "", [one.name]),
+    const isMeasured = !isOpen(job) && job.state.stage !== "failed";
+    const rows = (job.before_after ?? []).map((one) => make("div", `before-after ${(isMeasured && one.verdict_after) || "none"}`, [
+      make("div", "what", [icon(isMeasured ? one.verdict_after : "none"), make("b", "", [one.name]), ...(isMeasured ? [make("b", "now", [verdictWord(one.verdict_after)])] : [])]),
       make("span", "was", [make("small", "", [t("job.before")]), mm(one.before_mm), make("small", one.verdict_before, [verdictWord(one.verdict_before)])]),
       make("span", "arrow", ["→"], { "aria-hidden": "true" }),
-      make("span", "is", [make("small", "", [t("job.after")]), mm(one.after_mm), make("small", one.verdict_after ?? "", [icon(one.verdict_after ?? "busy"), verdictWord(one.verdict_after)])]),
+      make("span", "is", [make("small", "", [t("job.after")]), mm(one.after_mm), make("small", "", [isMeasured ? verdictWord(one.verdict_after) : t("parts.measuring")])]),
     ]));
     return rows;
   }
@@ -140,14 +152,17 @@ export class ResultsView {
 /** What the station says of a failure in its own language, where the page has no words for it. */
 const original = (state) => (state.original ? [make("details", "", [make("summary", "", [t("job.failed_why")]), make("p", "", [state.original], { lang: "en" })])] : []);
 
+/** Whether numbers are still to come: none that is shown is a verdict. */
+export const isOpen = ({ state }) => Boolean(state.is_rough) || ["collecting", "measuring"].includes(state.stage);
+
 /** A length as text; a dash where there is none. */
-const mm = (value) => make("b", "", [value === null || value === undefined ? "–" : `${value.toFixed(2)} mm`]);
+const mm = (value) => make("b", "", [value === null || value === undefined ? "–" : `${decimal(value.toFixed(2))} mm`]);
 
 /** What was decided about a component, and what the check after rework found. */
 function remarks(one, decision, again) {
   const found = [];
   if (again?.after_mm !== null && again?.after_mm !== undefined) {
-    found.push(make("span", `note ${again.verdict_after}`, [icon(again.verdict_after), t("job.again", { before: again.before_mm?.toFixed(2) ?? "–", after: again.after_mm.toFixed(2), verdict: verdictWord(again.verdict_after) })]));
+    found.push(make("span", `note ${again.verdict_after}`, [icon(again.verdict_after), t("job.again", { before: again.before_mm === null ? "–" : decimal(again.before_mm.toFixed(2)), after: decimal(again.after_mm.toFixed(2)), verdict: verdictWord(again.verdict_after) })]));
   }
   if (decision) {
     found.push(make("span", `note ${decision.is_ok ? "pass" : "fail"}`, [icon(decision.is_ok ? "pass" : "fail"), t(decision.is_ok ? "job.is_ok" : "job.is_not_ok", { by: decision.by }), decision.reason ? `: ${decision.reason}` : ""]));

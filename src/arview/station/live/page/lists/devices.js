@@ -1,5 +1,6 @@
 // The section with the devices that are paired with the station: when each was seen last, and taking its access away.
 
+import { confirmed } from "../confirm.js";
 import { icon, make } from "../icons.js";
 import { ageText } from "../parts.js";
 import { t } from "../texts/texts.js";
@@ -70,25 +71,4 @@ export class Devices {
     }
     await this.refresh();
   }
-}
-
-/** Whether the user confirms; nothing is done by Escape, or by Enter alone: the focus begins on "no". */
-async function confirmed({ title, text, yes, no }) {
-  const sure = make("button", "wide danger", [yes], { type: "button" }), keep = make("button", "wide", [no], { type: "button" });
-  const dialog = make("dialog", "dialog", [make("h2", "", [title], { id: "confirm-title" }), make("p", "text", [text], { id: "confirm-text" }), sure, keep], {
-    role: "alertdialog", "aria-labelledby": "confirm-title", "aria-describedby": "confirm-text",
-  });
-  document.body.append(dialog);
-  const opener = document.activeElement;
-  const answer = await new Promise((resolve) => {
-    sure.addEventListener("click", () => resolve(true));
-    keep.addEventListener("click", () => resolve(false));
-    dialog.addEventListener("cancel", () => resolve(false));
-    dialog.showModal();
-    keep.focus();
-  });
-  dialog.close();
-  dialog.remove();
-  opener?.focus?.({ preventScroll: true });
-  return answer;
 }

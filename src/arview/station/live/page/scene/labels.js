@@ -9,6 +9,8 @@ import { t } from "../texts/texts.js";
 
 const MAX_LABELS = 12;
 const NARROW_PX = 560, MAX_NARROW_LABELS = 4; // on a phone in portrait more labels would hide the part
+const MAX_NARROW_SHARE = 0.25; // of the area for labels, which is hardly more than the picture while a panel is open
+const MAX_HIDDEN = 0.06; // share of the visible cells of failed components that a label may cover
 const LABEL_ROOM_PX = 55; // height of the area for each label
 const MIN_ROOM_PX = 200; // in a lower area only an isolated component has a label
 const CONTEXT_WEIGHT = 0.25; // cost of covering a component that was not inspected, relative to an inspected one
@@ -79,19 +81,20 @@ export class Labels {
 
   /** Set the map of visible components (see Ghost.visibility). */
   setVisibility({ columns, rows, cells, window }) {
-    const integral = new Float64Array((columns + 1) * (rows + 1)), counts = new Map();
+    const integral = new Float64Array((columns + 1) * (rows + 1)), counts = new Map(), urgent = [];
     for (let row = 0; row < rows; row++) {
       let sum = 0;
       for (let column = 0; column < columns; column++) {
         const number = cells[row * columns + column];
         if (number) {
           counts.set(number - 1, (counts.get(number - 1) ?? 0) + 1);
+          if (this.all[number - 1] && this.#isUrgent(this.all[number - 1])) urgent.push([column, row]);
           sum += this.all[number - 1]?.rank === null ? CONTEXT_WEIGHT : 1;
         }
         integral[(row + 1) * (columns + 1) + column + 1] = integral[row * (columns + 1) + column + 1] + sum;
       }
     }
-    this.#integral = { columns, rows, integral, window };
+    this.#integral = { columns, rows, integral, window, urgent };
     this.#visible = counts;
   }
 
@@ -142,7 +145,9 @@ export class Labels {
       this.remeasure();
     }
     const maxLabels = isCramped ? 0 : isNarrow ? MAX_NARROW_LABELS : Math.min(MAX_LABELS, Math.floor(area.height / LABEL_ROOM_PX));
-    const requests = [], signs = new Map();
+    const requests = [], signs = new Map(), roomPx = isNarrow ? MAX_NARROW_SHARE * area.width * area.height : Infinity;
+    const away = new Set(); // out of view: without its label nothing would say so
+    let usedPx = 0;
     for (const label of this.#labels.values()) label.pointer.setAttribute("visibility", "hidden");
     for (const component of labels ? wanted : []) {
       let anchor = toScreen(component.part, component.anchor_in_model) ?? this.#behind(pose, component, picture);
@@ -150,13 +155,17 @@ export class Labels {
       if (outside) anchor = this.#pointOut(label, anchor, picture);
       this.#pointHere(label, component, outside, toScreen);
       if (!anchor || !isInside(anchor, picture) || !this.#isLabelled(component)) continue;
-      if (!outside) signs.set(component.index, anchor);
+      if (outside) away.add(component.index);
+      else signs.set(component.index, anchor);
       if (requests.length === maxLabels) continue;
       if (!label.width) [label.width, label.height] = [label.element.offsetWidth, label.element.offsetHeight];
+      if (usedPx + label.width * label.height > roomPx && !only) continue; // its sign stays
+      usedPx += label.width * label.height;
       requests.push({ key: component.index, width: label.width, height: label.height, x: anchor[0], y: anchor[1] });
     }
     const covered = (left, top, width, height) => this.#covered(place, left, top, width, height);
-    const placed = this.#layout.place(area, requests, this.#extent(place, requests), covered, glides);
+    const laid = this.#layout.place(area, requests, this.#extent(place, requests), covered, glides);
+    const placed = laid.filter(({ key, left, top }) => away.has(key) || this.#hiddenBy(place, left, top, this.#labels.get(key)) <= MAX_HIDDEN);
     const anchors = new Map(requests.map((one) => [one.key, one]));
     const names = new Set(placed.map((one) => one.key));
     const boxes = placed.map(({ key, left, top }) => grown(left, top, this.#labels.get(key)));
@@ -214,7 +223,7 @@ export class Labels {
     const isPending = component.is_pending && seen?.evidence !== "displaced";
     const value = isPending ? t("parts.measuring") : seen ? seen.value : component.value_text || (component.missing ? t("parts.missing") : "");
     const u = kind === component.verdict ? component.uncertainty_mm : null;
-    const detail = seen ? seen.notes.join(", ") : component.verdict !== "pass" ? component.detail_text : "";
+    const detail = seen ? seen.notes.join(", ") : component.verdict !== "pass" ? whole(component.detail_text) : "";
     const what = [make("span", "verdict", [seen?.word ?? (component.verdict ? t(`verdict.${component.verdict}`) : component.verdict_text ?? "")])];
     if (u !== null && (seen || !detail)) what.unshift(make("span", "u", [`U ${rounded(u, u)}`]));
     if (value) what.unshift(make("span", "value", [value]));
@@ -293,6 +302,16 @@ export class Labels {
     return (sum * cell * cell) / (width * height);
   }
 
+  /** Share of the visible cells of failed and undecided components that a label would hide. */
+  #hiddenBy(place, left, top, { width, height }) {
+    if (!this.#integral?.urgent.length) return 0;
+    const { columns, rows, window, urgent } = this.#integral;
+    const column = (x) => (((x - place.left) / place.scale - window.left) / window.width) * columns;
+    const row = (y) => (((y - place.top) / place.scale - window.top) / window.height) * rows;
+    const [c0, c1, r0, r1] = [column(left), column(left + width), row(top), row(top + height)];
+    return urgent.filter(([c, r]) => c + 0.5 > c0 && c + 0.5 < c1 && r + 0.5 > r0 && r + 0.5 < r1).length / urgent.length;
+  }
+
   #put({ key, left, top, side, isNew }, anchor) {
     const label = this.#labels.get(key), { element, leader, dot, width, height } = label;
     element.style.transform = `translate(${left.toFixed(1)}px, ${top.toFixed(1)}px)`;
@@ -367,6 +386,9 @@ function arrowPath([x0, y0], [x1, y1]) {
   const neck = length - head;
   return `M${at(0, shaft)}L${at(neck, shaft)}L${at(neck, half)}L${at(length, 0)}L${at(neck, -half)}L${at(neck, -shaft)}L${at(0, -shaft)}Z`;
 }
+
+/** Numbers with their names, which are never broken between the two. */
+const whole = (text) => text.split(/ {2,}/).map((one) => one.replaceAll(" ", "\u00a0")).join("  ");
 
 /** A name whose end stays whole where it is too long, so that it is shortened in its middle. */
 function middled(name) {

@@ -94,6 +94,11 @@ export class LabelLayout {
       return { key: one.key, y: was + share * (rows[i] - was), isNew, height: one.height };
     });
     // The area may have shrunk while labels were moving.
+    let high = area.top + area.height;
+    for (const one of [...placed].reverse()) {
+      one.y = Math.min(one.y, high - one.height);
+      high = one.y - GAP_PX;
+    }
     let low = area.top;
     for (const one of placed) {
       one.y = Math.max(one.y, low);

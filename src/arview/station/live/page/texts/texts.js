@@ -16,6 +16,9 @@ export function chosen(wanted) {
   return codes.find((code) => code in catalogues) ?? "en";
 }
 
+/** Numbers in a text with the decimal sign of the language. */
+export const decimal = (text) => (language === "de" ? text.replace(/(?<![\d.])(\d+)\.(\d+)(?![\d.])/g, "$1,$2") : text);
+
 /** Add texts {en: {key: text}, de: …} of another part of the page. */
 export function addTexts(more) {
   for (const [code, texts] of Object.entries(more)) Object.assign((catalogues[code] ??= {}), texts);
@@ -34,10 +37,12 @@ export function t(key, values = {}) {
 /** A value of a text: another text {key, values}, a list of them, or a name or number. */
 function inWords(value) {
   if (Array.isArray(value)) return value.map(inWords).join(", ");
-  return value?.key ? t(value.key, value.values) : String(value);
+  return value?.key ? t(value.key, value.values) : NUMBER.test(value) ? decimal(String(value)) : String(value);
 }
 
-const SAID = new Set(["text", "reason", "remark", "title", "value", "word", "notes", "value_text", "mismatches", "lacking"]);
+const NUMBER = /^[-−+≈]? ?\d+\.\d+( ± \d+\.\d+)?( mm)?$/; // a value that is a number, not a name
+const SAID = new Set(["text", "reason", "remark", "title", "value", "word", "notes", "value_text", "mismatches", "lacking", "steps", "place", "how", "note"]);
+const NUMBERS = new Set(["value", "value_text", "detail_text"]); // texts of numbers, beside words in the language
 const OF_PEOPLE = new Set(["decisions", "signed", "record", "messages"]); // what people wrote stays as it is
 
 /** A document of the server with its sentences in the language of the page; see `messages` in the protocol. */
@@ -54,11 +59,13 @@ function inLanguage(value, messages) {
     if (OF_PEOPLE.has(key)) made[key] = one;
     else if (SAID.has(key)) made[key] = Array.isArray(one) ? one.map((text) => sentence(text, known)) : typeof one === "string" ? sentence(one, known) : inLanguage(one, known);
     else made[key] = inLanguage(one, known);
+    if (NUMBERS.has(key) && typeof made[key] === "string") made[key] = decimal(made[key]);
   }
   if (typeof value.completeness === "string") made.completeness_text = sentence(value.completeness, known);
   const isUnknown = typeof value.text === "string" && value.text !== "" && made.text === value.text;
   // A notice has a sentence for its code; the state of a job has its stage, and its text is kept as it came.
   if (isUnknown && typeof value.code === "string" && hasText(`code.${value.code}`)) made.text = t(`code.${value.code}`);
+  if (isUnknown && value.kind === "station" && hasText(`code.source_${value.state}`)) made.text = t(`code.source_${value.state}`);
   if (isUnknown && typeof value.stage === "string") Object.assign(made, { text: "", original: value.text });
   return made;
 }
