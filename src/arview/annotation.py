@@ -18,7 +18,6 @@ from typing import Protocol
 
 from arview.camera import Camera
 from arview.core.checks import check_type
-from arview.core.progress import until_stopped
 from arview.errors import OutputError
 from arview.pose import Completeness, Pose, Presence
 from arview.pose_file import PoseWriter
@@ -167,7 +166,7 @@ def annotate(
     try:
         outputs.open(overlay, poses_path, camera_of)
         try:
-            for frame in until_stopped(source):
+            for frame in source:
                 if start_s is not None and frame.time_s < start_s:
                     continue
                 if end_s is not None and frame.time_s >= end_s:

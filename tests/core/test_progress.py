@@ -15,13 +15,13 @@ from click.testing import CliRunner
 
 from arview.cli import ExitCode, main
 from arview.core.atomic import begin_unfinished, replacing, unfinished_path
-from arview.core.progress import check_stop, stops_by_signals, until_stopped
+from arview.core.progress import check_stop, stops_by_signals
 
 KERNEL = """
 import sys, time
 from typing import NamedTuple
 import numba
-from arview.core.progress import until_stopped
+from arview.core.progress import check_stop, stops_by_signals
 
 class Pair(NamedTuple):
     a: float
@@ -35,9 +35,11 @@ made(1.0)
 print("ready", flush=True)
 done = 0
 try:
-    for step in until_stopped(range(10**9)):
-        {body}
-        done += 1
+    with stops_by_signals():
+        while True:
+            check_stop()
+            {body}
+            done += 1
 except KeyboardInterrupt:
     print("stopped", done, flush=True)
     sys.exit(7)
@@ -89,10 +91,10 @@ def test_ignored_signals_stay_ignored() -> None:
 
 def test_handlers_are_put_back() -> None:
     before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGALRM)]
-    with pytest.raises(KeyboardInterrupt):
-        for step in until_stopped(range(3)):
-            if step == 1:
-                os.kill(os.getpid(), signal.SIGTERM)
+    with pytest.raises(KeyboardInterrupt), stops_by_signals():
+        check_stop()
+        os.kill(os.getpid(), signal.SIGTERM)
+        check_stop()
     assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGALRM)] == before
     check_stop()
 

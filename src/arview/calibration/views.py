@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from arview.calibration.board_view import MIN_CORNERS, BoardView, blur_of
 from arview.calibration.diagnosis import diagnose_missing_board, diagnose_missing_plain_board
 from arview.calibration.plain_boards import PlainBoardFinder
-from arview.camera import HEIF_SUFFIXES, PHOTO_SUFFIXES, PhotoExif
+from arview.camera import PHOTO_SUFFIXES, PhotoExif
 from arview.core.progress import StepProgress
 from arview.errors import InputError
 from arview.fiducials import Board, cv_board
@@ -256,7 +256,7 @@ def _view_of_photo(path: Path, name: str, turns: int, finder: BoardFinder | Plai
 
 def _is_video(path: Path) -> bool:
     """Whether a file is taken for a video: it exists and is not a photo by its suffix."""
-    return path.is_file() and path.suffix.lower() not in PHOTO_SUFFIXES | HEIF_SUFFIXES
+    return path.is_file() and path.suffix.lower() not in PHOTO_SUFFIXES
 
 
 def _views_of_video(

@@ -5,7 +5,6 @@ from typing import TYPE_CHECKING
 from arview.core.doors import lazy_door
 
 if TYPE_CHECKING:
-    from arview.camera.exif import HEIF_SUFFIXES as HEIF_SUFFIXES
     from arview.camera.exif import PHOTO_SUFFIXES as PHOTO_SUFFIXES
     from arview.camera.exif import PhotoExif as PhotoExif
     from arview.camera.exif import check_jpeg_scans as check_jpeg_scans
@@ -41,7 +40,6 @@ __getattr__, __dir__, __all__ = lazy_door(
     __name__,
     {
         "exif": (
-            "HEIF_SUFFIXES",
             "PHOTO_SUFFIXES",
             "PhotoExif",
             "check_jpeg_scans",

@@ -16,8 +16,7 @@ from arview.errors import InputError
 if TYPE_CHECKING:
     from PIL.Image import Image
 
-PHOTO_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp"})
-HEIF_SUFFIXES = frozenset({".heic", ".heif", ".hif"})
+PHOTO_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".heic", ".heif", ".hif"})
 
 MAX_JPEG_SCANS = 100
 """Most scans of a JPEG that is decoded: progressive ones have about ten, and each takes as long as a picture."""
@@ -131,7 +130,7 @@ def photos_of(source: Path) -> list[Path]:
         candidates = sorted(source.iterdir())
     elif not source.is_file():
         candidates = sorted(source.parent.glob(source.name)) if source.parent.is_dir() else []
-    return [path for path in candidates if path.suffix.lower() in PHOTO_SUFFIXES | HEIF_SUFFIXES]
+    return [path for path in candidates if path.suffix.lower() in PHOTO_SUFFIXES]
 
 
 def read_exif(path: Path) -> PhotoExif:

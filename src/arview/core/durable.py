@@ -20,6 +20,9 @@ def replace_durably(path: Path, content: bytes) -> None:
         file.write(content)
         file.flush()
         os.fsync(file.fileno())
+    for folder in (path.parent, path.absolute().parent.parent):  # the folder may be new
+        with suppress(PermissionError):
+            _sync_folder(folder)
 
 
 def append_durably(file: IO[bytes], length: int, content: bytes) -> None:
@@ -38,6 +41,8 @@ def append_durably(file: IO[bytes], length: int, content: bytes) -> None:
         while len(rest):
             rest = rest[os.write(file.fileno(), rest) :]
         os.fsync(file.fileno())
+        if length == 0:
+            _sync_folder(Path(file.name).parent)
     except OSError:
         with suppress(OSError):
             os.ftruncate(file.fileno(), length)
@@ -54,7 +59,7 @@ def set_aside(path: Path, torn: bytes) -> None:
         append_durably(file, os.fstat(file.fileno()).st_size, torn + b"\n")
 
 
-def sync_folder(folder: Path) -> None:
+def _sync_folder(folder: Path) -> None:
     """Bring the names of a folder's files to the disk.
 
     Raises:

@@ -8,13 +8,12 @@ from __future__ import annotations
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from traceback import walk_stack
 from types import FrameType
-from typing import TypeAlias, TypeVar
+from typing import TypeAlias
 
-T = TypeVar("T")
 Progress: TypeAlias = Callable[[str, int, int], None]
 """Called as ``progress(stage, done, total)``: the name of the stage, the steps done and the steps of that stage.
 
@@ -59,14 +58,6 @@ def stops_by_signals() -> Iterator[None]:
         _is_asked.clear()
         for number, handler in before.items():
             signal.signal(number, handler)
-
-
-def until_stopped(items: Iterable[T]) -> Iterator[T]:
-    """The items until a signal asks to stop, when KeyboardInterrupt is raised between two of them."""
-    with stops_by_signals():
-        for item in items:
-            check_stop()
-            yield item
 
 
 def _ask(number: int, frame: FrameType | None) -> None:

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.camera import HEIF_SUFFIXES, PHOTO_SUFFIXES, check_jpeg_scans, open_picture, read_exif
+from arview.camera import PHOTO_SUFFIXES, check_jpeg_scans, open_picture, read_exif
 from arview.core.extras import load
 from arview.errors import InputError, MissingDependencyError
 from arview.video.frame import Frame, Image
@@ -24,7 +24,7 @@ from arview.video.tiff import SUFFIXES as TIFF_SUFFIXES
 from arview.video.tiff import tiff_pages
 
 RAW_SUFFIXES = frozenset({".dng"})
-SUFFIXES = PHOTO_SUFFIXES | HEIF_SUFFIXES | RAW_SUFFIXES
+SUFFIXES = PHOTO_SUFFIXES | RAW_SUFFIXES
 MAX_NUMBER = 99_999_999
 """Largest number in a file name that is taken for that of a frame; longer ones are dates or clocks."""
 PROBED_PICTURES = 5
@@ -148,7 +148,7 @@ class PictureSource(FrameSource):
         data = self._checked_bytes(path)
         if data is None:
             return None
-        if path.suffix.lower() in HEIF_SUFFIXES:
+        if data[4:8] == b"ftyp":
             return _read_heif(data)
         if path.suffix.lower() in RAW_SUFFIXES:
             return _read_raw(data)

@@ -10,7 +10,7 @@ import hashlib
 import re
 from pathlib import Path
 
-from arview.core.durable import replace_durably, sync_folder
+from arview.core.durable import replace_durably
 from arview.errors import InputError, OutputError
 from arview.quality.decisions.entry import Decision
 
@@ -46,8 +46,6 @@ def attach_photo(folder: Path, content: bytes) -> str:
         try:
             (folder / _FOLDER).mkdir(parents=True, exist_ok=True)
             replace_durably(folder / name, content)
-            sync_folder(folder / _FOLDER)
-            sync_folder(folder)
         except OSError as error:
             raise OutputError(f"{folder / name}: cannot be written ({error.strerror or error})") from error
     return name

@@ -17,7 +17,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import IO, Any
 
-from arview.core.durable import append_durably, replace_durably, set_aside, sync_folder
+from arview.core.durable import append_durably, replace_durably, set_aside
 from arview.errors import InputError, OutputError
 from arview.quality.decisions.entry import FIRST, Decision, checked_name, checked_text, entry_of, line_of
 
@@ -202,7 +202,6 @@ class DecisionLog:
     def _append(self, entry: Decision) -> Decision:
         """Add an entry behind the last one, under the lock; a torn line is set aside first."""
         try:
-            is_new = not self.path.exists()
             with self.path.open("a+b", buffering=0) as file, _locked(file, fcntl.LOCK_EX):
                 file.seek(0)
                 data = file.read()
@@ -226,8 +225,6 @@ class DecisionLog:
                     file.truncate(len(data))
                 # A last line that is whole but for its end gets it.
                 append_durably(file, len(data), (b"\n" if data and not data.endswith(b"\n") else b"") + line + b"\n")
-                if is_new:
-                    sync_folder(self.path.parent)
                 self._write_end(made)
         except OSError as error:
             raise OutputError(f"{self.path}: the entry was not kept ({error.strerror or error})") from error

@@ -13,7 +13,7 @@ from pathlib import Path
 from arview.core.progress import Progress
 from arview.errors import InputError
 from arview.reconstruction.dense.depth import depth_maps
-from arview.reconstruction.dense.files import read_map, read_ply, write_map, write_maps, write_ply
+from arview.reconstruction.dense.files import read_ply, write_map, write_maps, write_ply
 from arview.reconstruction.dense.fusion import fuse
 from arview.reconstruction.dense.options import MIN_VIEWS, DenseOptions
 from arview.reconstruction.dense.views import Cad, DenseView, choose_sources, make_view
@@ -22,7 +22,6 @@ from arview.reconstruction.types import DenseCloud, SparseModel
 __all__ = [
     "Cad",
     "DenseOptions",
-    "read_map",
     "read_ply",
     "reconstruct_dense",
     "write_map",

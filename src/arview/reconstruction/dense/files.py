@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from arview.core.atomic import replacing
 from arview.errors import InputError, OutputError
 from arview.reconstruction.dense.depth import DepthMap
-from arview.reconstruction.dense.views import Floats
 from arview.reconstruction.types import DenseCloud
 
 _FIELDS = {
@@ -39,20 +38,6 @@ def write_map(path: Path, image: NDArray[np.float32]) -> None:
             file.write(header + np.ascontiguousarray(channels.transpose(2, 0, 1), dtype="<f4").tobytes())
     except OSError as error:
         raise OutputError(f"{path}: cannot be written ({error.strerror or error})") from error
-
-
-def read_map(path: Path) -> Floats:
-    """Read the (H,W) or (H,W,C) float32 array of a file written by `write_map` or COLMAP. Raises InputError."""
-    try:
-        data = path.read_bytes()
-        width, height, channels = (int(number) for number in data[:64].split(b"&", 3)[:3])
-        start = len(f"{width}&{height}&{channels}&")
-        values = np.frombuffer(data, dtype="<f4", offset=start).reshape(channels, height, width)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
-    except ValueError as error:
-        raise InputError(f"{path}: is not a COLMAP map, or is truncated") from error
-    return np.ascontiguousarray(values[0] if channels == 1 else values.transpose(1, 2, 0), dtype=np.float32)
 
 
 def write_maps(folder: Path, name: str, m: DepthMap) -> None:

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.camera import HEIF_SUFFIXES, PHOTO_SUFFIXES, PhotoExif, exif_of, open_picture
+from arview.camera import PHOTO_SUFFIXES, PhotoExif, exif_of, open_picture
 from arview.errors import InputError
 from arview.reconstruction.intake.kept import kept
 from arview.video import sorted_naturally
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 Pixels = NDArray[np.uint8]
 
-SUFFIXES = PHOTO_SUFFIXES | HEIF_SUFFIXES
+SUFFIXES = PHOTO_SUFFIXES
 RAW_SUFFIXES = frozenset({".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2"})
 GLANCE_PX = 2000  # longest side at which photos are checked: about the size at which features are found
 

@@ -17,9 +17,8 @@ from PIL import Image
 
 from arview import reconstruction
 from arview.cad import Part
-from arview.camera import HEIF_SUFFIXES, PHOTO_SUFFIXES, Camera
+from arview.camera import PHOTO_SUFFIXES, Camera
 from arview.core.atomic import write_file
-from arview.core.progress import until_stopped
 from arview.errors import OutputError
 from arview.pose import Pose
 from arview.station import capture
@@ -133,7 +132,7 @@ def capture_photos(
     advice: capture.CaptureAdvice | None = None
     frames, is_interrupted = 0, False
     try:
-        for frame in until_stopped(source):
+        for frame in source:
             frames += 1
             (pose,) = session.process(frame.image, frame.index, frame.time_s)
             camera = camera_of(frame.index)
@@ -211,7 +210,7 @@ def _picture(frame: Frame, source: FrameSource) -> Path | None:
     if not isinstance(source, PictureSource) or not frame.file or source.unsquared_size is not None:
         return None
     path = source.first_path.parent / frame.file
-    return path if path.is_file() and path.suffix.lower() in PHOTO_SUFFIXES | HEIF_SUFFIXES else None
+    return path if path.is_file() and path.suffix.lower() in PHOTO_SUFFIXES else None
 
 
 def summary_lines(summary: CaptureSummary, part: Part) -> list[str]:

@@ -35,7 +35,7 @@ from typing import Any
 
 from arview.cad import Model, Part
 from arview.core.atomic import replacing
-from arview.core.durable import append_durably, replace_durably, set_aside, sync_folder
+from arview.core.durable import append_durably, replace_durably, set_aside
 from arview.errors import InputError, OutputError
 from arview.inspection import Inspection, load_inspection
 from arview.quality import decisions
@@ -48,20 +48,13 @@ from arview.station.walk.records import (
     checked_time,
     parse_line,
     photo_of_line,
+    suffix_of,
     utc_now,
 )
 
 FORMAT, VERSION = "arview job", 1
 _MAX_SERIAL = 100
 _UNSAFE = re.compile(r"[^A-Za-z0-9.-]+")
-_KINDS = (
-    (b"\xff\xd8\xff", ".jpg"),
-    (b"\x89PNG\r\n\x1a\n", ".png"),
-    (b"II*\0", ".tif"),
-    (b"MM\0*", ".tif"),
-    (b"BM", ".bmp"),
-)
-_HEIF_BRANDS = (b"heic", b"heix", b"hevc", b"mif1", b"msf1", b"heim", b"heis")
 
 
 @dataclass(frozen=True)
@@ -190,7 +183,7 @@ class JobFolder:
         sha256 = sha256.lower()
         if hashlib.sha256(content).hexdigest() != sha256:
             raise InputError("the photo does not have the hash that was sent with it; send it again")
-        suffix = _suffix(content)
+        suffix = suffix_of(content)
         hint, taken = checked_hint(hint), checked_time(taken)
         with self._exclusive():
             log = _read_log(self.path / "photos.jsonl")
@@ -204,7 +197,7 @@ class JobFolder:
                 {"name": name, "sha256": sha256, "bytes": len(content), "taken": taken, "source": source, "hint": hint}
             )
             try:
-                _write_durably(self.path / "photos" / name, content)
+                replace_durably(self.path / "photos" / name, content)
             except OSError as error:
                 raise _cannot_write(self.path, error) from error
             self._append(vars(photo), log)
@@ -282,7 +275,6 @@ class JobFolder:
             size = log.size - len(log.torn)
             with path.open("ab", buffering=0) as file:
                 append_durably(file, size, line)
-            sync_folder(self.path)
         except OSError as error:
             raise _cannot_write(self.path, error) from error
 
@@ -453,16 +445,6 @@ def _time_of(text: Any) -> datetime:
     return time if time.tzinfo is not None else time.replace(tzinfo=UTC)
 
 
-def _suffix(content: bytes) -> str:
-    """Ending of a photo's file name by its content. Raises InputError when it is no photo."""
-    for start, suffix in _KINDS:
-        if content.startswith(start):
-            return suffix
-    if content[4:8] == b"ftyp" and content[8:12] in _HEIF_BRANDS:
-        return ".heic"
-    raise InputError("is no photo; send JPEG, PNG, HEIC, TIFF or BMP")
-
-
 def _safe(text: str) -> str:
     """A text for a file name: letters, digits, dots and hyphens."""
     return _UNSAFE.sub("-", text).strip(".-")[:40] or "x"
@@ -488,8 +470,7 @@ def _written(folder: Path, document: dict[str, Any]) -> JobFolder:
     """The job of a new folder. ``job.json`` comes last, so that a folder without it is no job."""
     try:
         (folder / "photos").mkdir()
-        _write_durably(folder / "job.json", (json.dumps(document, ensure_ascii=False, indent=1) + "\n").encode())
-        sync_folder(folder.parent)
+        replace_durably(folder / "job.json", (json.dumps(document, ensure_ascii=False, indent=1) + "\n").encode())
     except OSError as error:
         raise _cannot_write(folder, error) from error
     return JobFolder(folder, document)
@@ -503,12 +484,6 @@ def _jobs_below(folder: Path) -> list[JobFolder]:
         except InputError:
             continue
     return found
-
-
-def _write_durably(path: Path, content: bytes) -> None:
-    """Write a file that is on the disk, with its name, when this returns."""
-    replace_durably(path, content)
-    sync_folder(path.parent)
 
 
 def _cannot_write(path: Path, error: OSError) -> OutputError:

@@ -21,6 +21,15 @@ CloudState = Literal["waiting", "running", "done", "failed"]
 _SHA256 = re.compile(r"[0-9a-f]{64}")
 _NAME = re.compile(r"\d{4,}\.(jpg|png|heic|tif|bmp)")
 
+_KINDS = (
+    (b"\xff\xd8\xff", ".jpg"),
+    (b"\x89PNG\r\n\x1a\n", ".png"),
+    (b"II*\0", ".tif"),
+    (b"MM\0*", ".tif"),
+    (b"BM", ".bmp"),
+)
+_HEIF_BRANDS = (b"heic", b"heix", b"hevc", b"mif1", b"msf1", b"heim", b"heis")
+
 
 @dataclass(frozen=True)
 class StoredPhoto:
@@ -143,6 +152,16 @@ def checked_hint(hint: Mapping[str, Any] | None) -> dict[str, Any] | None:
             raise InputError("hint: quality: expected a number from 0 to 1")
         quality = float(quality)
     return {"cam_from_model": pose, "camera": camera, "quality": quality}
+
+
+def suffix_of(content: bytes) -> str:
+    """Ending of a photo's file name by its content. Raises InputError when it is no photo."""
+    for start, suffix in _KINDS:
+        if content.startswith(start):
+            return suffix
+    if content[4:8] == b"ftyp" and content[8:12] in _HEIF_BRANDS:
+        return ".heic"
+    raise InputError("is no photo; send JPEG, PNG, HEIC, TIFF or BMP")
 
 
 def checked_time(taken: str | datetime | None) -> str:
