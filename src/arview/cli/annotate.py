@@ -220,7 +220,7 @@ def annotate(
         if outputs.video is not None:
             sink = open_sink(outputs.video, frames)
             overlay = FollowingOverlay(partial(workflow.make_overlay, specimens, drawing), session.camera_of)
-        with progress_bar("frames", frames.frame_count) as progress:
+        with progress_bar("frames") as progress:
             summary = annotate_frames(
                 frames,
                 session,

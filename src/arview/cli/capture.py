@@ -100,7 +100,7 @@ def capture(
             keep = partial(report_estimate, profile=None, source=source, turns=frames.quarter_turns_clockwise)
             tracked = tracking.TrackedPart(views, part.model, initial_cam_from_model=first_pose)
             session = start_session([tracked], frames, camera, None, keep if camera_spec is None else None)
-            with progress_bar("frames", frames.frame_count) as progress:
+            with progress_bar("frames") as progress:
                 show = _Teller(frames.is_live, frames.frame_count or 0, progress)
                 summary = walk.capture_photos(
                     frames, session, part, session.camera_of, job, walk.capture_options(count), show

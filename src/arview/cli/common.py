@@ -387,23 +387,15 @@ def load_pose(path: str) -> Array:
 
 
 @contextmanager
-def progress_bar(label: str, total: int | None = None) -> Iterator[StepProgress]:
-    """Show a bar on stderr if it is a terminal; yields what moves it, and ends the work after Ctrl-C."""
-    from tqdm import tqdm
-
-    with tqdm(desc=label, total=total, disable=None, leave=False, unit="") as bar:
-
-        def update(done: int, in_all: int) -> None:
-            check_stop()
-            bar.total = in_all or None
-            bar.update(done - bar.n)
-
-        yield update
+def progress_bar(label: str) -> Iterator[StepProgress]:
+    """Show a bar for work of one stage; as `stage_bar`."""
+    with stage_bar() as progress:
+        yield partial(progress, label)
 
 
 @contextmanager
 def stage_bar() -> Iterator[Progress]:
-    """Show a bar for work in stages on stderr if it is a terminal; yields what moves it, see `progress_bar`."""
+    """Show a bar on stderr if it is a terminal; yields what moves it, and ends the work after Ctrl-C."""
     from tqdm import tqdm
 
     with tqdm(disable=None, leave=False, unit="") as bar:

@@ -99,7 +99,7 @@ def add(inspections: tuple[str, ...], station: str | None, store: str | None) ->
     """Add the INSPECTIONs to the store."""
     new = same = decided = 0
     failed: list[str] = []
-    with _open(store) as opened, progress_bar("history", len(inspections)) as progress:
+    with _open(store) as opened, progress_bar("history") as progress:
         for done, path in enumerate(inspections, 1):
             try:
                 added = opened.add(path, station)

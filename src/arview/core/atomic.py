@@ -14,9 +14,6 @@ from typing import BinaryIO
 
 from arview.errors import OutputError
 
-_LEFTOVER_S = 60.0
-"""Age of a temporary file whose process is gone, after which it is removed."""
-
 
 @contextmanager
 def replacing(path: Path) -> Iterator[BinaryIO]:
@@ -74,7 +71,7 @@ def _remove_leftovers(folder: Path) -> None:
     for path in folder.glob(".*.tmp"):
         process = path.name.split(".")[-3]
         with suppress(OSError):
-            is_old = time.time() - path.stat().st_mtime > _LEFTOVER_S  # a younger one may be another machine's
+            is_old = time.time() - path.stat().st_mtime > 60.0  # a younger one may be another machine's
             if process.isdecimal() and is_old and not _is_running(int(process)):
                 path.unlink()
 

@@ -25,7 +25,6 @@ StepProgress: TypeAlias = Callable[[int, int], None]
 
 GRACE_S = 2.0
 """Time after which a step that has not looked at the flag is interrupted where it is."""
-_POLL_S = 0.02
 _SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
 _is_asked = threading.Event()
 
@@ -76,6 +75,6 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
     if any(
         str(inner.f_globals.get("__name__")).startswith(("namedtuple_", "numba.")) for inner, _ in walk_stack(frame)
     ):
-        signal.setitimer(signal.ITIMER_REAL, _POLL_S)
+        signal.setitimer(signal.ITIMER_REAL, 0.02)
         return
     raise KeyboardInterrupt

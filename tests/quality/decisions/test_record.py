@@ -20,6 +20,7 @@ from arview.inspection import Verdict, load_inspection, save_inspection
 from arview.inspection.fingerprint import component_fingerprint, fingerprint_of_file, values_fingerprint
 from arview.inspection.summary import overall_verdict
 from arview.quality.decisions import (
+    acting_device,
     decide_component,
     decisions_csv,
     decisions_path,
@@ -69,13 +70,13 @@ def test_a_deviation_is_accepted_and_released(job: Path) -> None:
 
 
 def test_what_is_open_or_rejected_is_not_released(job: Path) -> None:
-    sign_inspection(job, "Grace")
+    sign_inspection(job, "Grace", "as a concession")
     state = state_of_record(job)
     assert not state.is_released
     assert state.sentence.endswith("not released: open: block_2 is out of tolerance")
     decide_component(job, "block_2", False, "to be moved", by="Ada")
     decide_component(job, "block_1", False, "scratched", by="Ada")
-    sign_inspection(job, "Grace")
+    sign_inspection(job, "Grace", "as a concession")
     state = state_of_record(job)
     assert not state.is_released and not state.undecided
     assert "not OK: block_2: to be moved; block_1: scratched" in state.sentence
@@ -202,7 +203,7 @@ def test_faults_of_what_is_said(job: Path) -> None:
 
 def test_every_kind_of_finding_is_named(tmp_path: Path) -> None:
     save_inspection(bench_inspection(MODEL), tmp_path / "inspection.json")
-    sign_inspection(tmp_path, "Grace")
+    sign_inspection(tmp_path, "Grace", "as a concession")
     sentence = state_of_record(tmp_path).sentence
     for words in (
         "block_2 is out of tolerance", "block_3 is undecided", "block_4 is missing", "plate was not measured",
@@ -274,13 +275,13 @@ def test_a_check_that_fails_is_decided_about_anew(job: Path) -> None:
     decide_component(job, "block_2", True, "agreed", by="Ada")
     recheck(job, 1, (0.1, 0.0, 0.0))
     recheck(job, 2, (1.1, 0.0, 0.0))
-    sign_inspection(job, "Grace")
+    sign_inspection(job, "Grace", "as a concession")
     state = state_of_record(job)
     assert not state.is_released and state.undecided == ("block_2",)
     with pytest.raises(InputError, match="reason: is empty"):
         decide_component(job, "block_2", True, "", by="Ada")
     decide_component(job, "block_2", True, "as good as it gets", by="Ada")
-    sign_inspection(job, "Grace")
+    sign_inspection(job, "Grace", "as a concession")
     state = state_of_record(job)
     assert state.is_released and "1 deviation accepted (block_2: as good as it gets)" in state.sentence
     newest = load_inspection(job / "recheck" / "02" / "inspection.json").find("block_2")
@@ -332,3 +333,23 @@ def test_ok_and_not_ok_exclude_each_other(job: Path) -> None:
         main, ["decisions", "decide", str(job), "block_2", "--not-ok", "--reason", "r", "--by", "Ada"]
     )
     assert one.exit_code == 0 and [entry.is_ok for entry in log_of(job).content().entries] == [False]
+
+
+def test_a_failed_component_is_signed_with_a_reason_only(job: Path) -> None:
+    with pytest.raises(InputError, match=r"block_2.*out of tolerance, and nobody has decided"):
+        sign_inspection(job, "Grace")
+    assert log_of(job).entries() == ()
+    assert sign_inspection(job, "Grace", "agreed with the customer, no. 17").note.startswith("agreed")
+
+
+def test_the_device_is_in_the_entry_and_in_the_hash(job: Path) -> None:
+    token = acting_device.set("iPhone Safari")
+    try:
+        decide_component(job, "block_2", True, "agreed", by="Ada")
+    finally:
+        acting_device.reset(token)
+    decide_component(job, "block_2", False, "bent", by="Ada")
+    assert [one.device for one in log_of(job).entries()] == ["iPhone Safari", ""] and not log_of(job).faults()
+    path = log_of(job).path
+    path.write_bytes(path.read_bytes().replace(b"iPhone", b"iPad  "))
+    assert log_of(job).faults()

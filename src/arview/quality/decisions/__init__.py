@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from arview.quality.decisions.folder import tick_step as tick_step
     from arview.quality.decisions.log import DecisionLog as DecisionLog
     from arview.quality.decisions.log import LogContent as LogContent
+    from arview.quality.decisions.log import acting_device as acting_device
     from arview.quality.decisions.record import Recheck as Recheck
     from arview.quality.decisions.record import RecordState as RecordState
     from arview.quality.decisions.record import Signature as Signature
@@ -64,6 +65,7 @@ __getattr__, __dir__, __all__ = lazy_door(
         "log": (
             "DecisionLog",
             "LogContent",
+            "acting_device",
         ),
         "record": (
             "Recheck",

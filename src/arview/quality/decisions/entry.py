@@ -40,6 +40,7 @@ class Decision:
         is_done: of a tick.
         inspection_sha256: fingerprint of the values that were signed (`values_fingerprint`) or decided about
             (`component_fingerprint`); in older logs of the inspection's file; empty if unknown.
+        device: on which it was made, of those that are paired with the station; empty on the command line.
         rechecks: of a signature: fingerprints of the checks of reworked components that it holds for, in their order.
         previous: SHA-256 of the line before it.
         sha256: SHA-256 of its own line.
@@ -57,6 +58,7 @@ class Decision:
     step: int | None = None
     is_done: bool | None = None
     inspection_sha256: str = ""
+    device: str = ""
     rechecks: tuple[str, ...] = ()
     previous: str = FIRST
     sha256: str = ""
@@ -82,15 +84,16 @@ _TYPES: dict[str, tuple[type, ...]] = {
 
 def decision_document(entry: Decision) -> dict[str, Any]:
     """The entry as JSON, with the fields of its kind; what the log holds, the page gets and the exports write."""
-    document: dict[str, Any] = {
+    values: dict[str, Any] = {
         "entry": entry.number,
         "kind": entry.kind,
         "time": stamp(entry.time),
         "by": entry.by,
     }
-    values = {name: getattr(entry, name) for name in _FIELDS[entry.kind]}
+    values |= {name: getattr(entry, name) for name in _FIELDS[entry.kind]}
     values |= {name: list(value) for name, value in values.items() if isinstance(value, tuple)}
-    return document | values | {"previous": entry.previous}
+    values |= {"device": entry.device} if entry.device else {}
+    return values | {"previous": entry.previous}
 
 
 def line_of(entry: Decision) -> bytes:
@@ -108,7 +111,7 @@ def entry_of(line: bytes, sha256: str) -> Decision:
     if not isinstance(document, dict) or document.get("kind") not in KINDS:
         raise ValueError("not an entry")
     kind: Kind = document["kind"]
-    if set(document) != {"entry", "kind", "time", "by", "previous", *_FIELDS[kind]}:
+    if set(document) - {"device"} != {"entry", "kind", "time", "by", "previous", *_FIELDS[kind]}:
         raise ValueError("fields are missing or unknown")
     number, moment = document["entry"], datetime.fromisoformat(document["time"])
     if type(number) is not int or moment.tzinfo is None or not isinstance(document["by"], str):
@@ -129,6 +132,7 @@ def entry_of(line: bytes, sha256: str) -> Decision:
         time=moment.astimezone(UTC),
         by=document["by"],
         previous=document["previous"],
+        device=str(document.get("device", "")),
         sha256=sha256,
         **values,
     )

@@ -179,10 +179,17 @@ def sign_inspection(target: str | Path, by: str, note: str = "") -> Decision:
     It is about the values and verdicts: it holds while they stay the same, whatever else is written of them.
 
     Raises:
-        InputError: there is no inspection, or as `DecisionLog.sign`.
+        InputError: there is no inspection; a component failed that nobody decided about, and no note says why it is
+            signed all the same; or as `DecisionLog.sign`.
         OutputError: the log cannot be written.
     """
     path, inspection = _read(target)
+    undecided = () if note.strip() else state_of_record(path).undecided
+    if failed := [one.name for one in inspection.components if one.verdict is Verdict.FAIL and one.name in undecided]:
+        raise InputError(
+            f"{', '.join(failed)}: out of tolerance, and nobody has decided about it; decide first, or give the reason"
+            " of the concession as a note"
+        )
     rechecks = [check.sha256 for _, check in rechecks_of(path)]
     return log_of(path).sign(by, note, values_fingerprint(inspection), rechecks)
 

@@ -12,6 +12,7 @@ import hashlib
 import json
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -37,6 +38,10 @@ class LogContent:
     faults: tuple[str, ...] = ()
     torn: bytes = b""
     notices: tuple[str, ...] = ()
+
+
+acting_device: ContextVar[str] = ContextVar("acting_device", default="")
+"""The paired device for which this thread or task works."""
 
 
 class DecisionLog:
@@ -216,6 +221,7 @@ class DecisionLog:
                     entry,
                     number=1 if last is None else last.number + 1,
                     previous=FIRST if last is None else last.sha256,
+                    device=acting_device.get(),
                 )
                 line = line_of(made)
                 made = replace(made, sha256=_sha256(line))

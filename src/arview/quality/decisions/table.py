@@ -24,6 +24,7 @@ HEADER = (
     "is_done",
     "inspection_sha256",
     "sha256",
+    "device",
 )
 """Columns. Cells that an entry of its kind does not have are empty."""
 
@@ -50,6 +51,7 @@ def decisions_csv(entries: Sequence[Decision], part: str = "", serial: str = "")
             "" if one.is_done is None else str(one.is_done).lower(),
             one.inspection_sha256,
             one.sha256,
+            one.device,
         )
         writer.writerow([_text(cell) for cell in cells])
     return out.getvalue()

@@ -21,6 +21,7 @@ from arview.station.live.jobs.desk import JobDesk
 from arview.station.live.jobs.documents import job_document, job_row, rework
 from arview.station.live.jobs.records import tell_report_and_history
 from arview.station.live.jobs.uploads import Purpose, Upload, store_attachment, store_photo
+from arview.station.live.security.access import DEVICE
 from arview.station.live.security.limits import RateLimit, body, json_body
 from arview.station.live.security.refusals import Refusal
 from arview.station.live.server.hub import Hub
@@ -340,6 +341,7 @@ class JobHandlers:
         )
         if not is_done:
             raise Refusal(409, "not_done", "this part is not measured yet")
+        quality.acting_device.set(request.scope.get(DEVICE) or "")
         return job
 
     async def _document(self, job: walk.JobFolder, status: int = 200) -> Response:
