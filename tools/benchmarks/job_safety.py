@@ -1,5 +1,5 @@
 #!/usr/bin/env python
-"""What happens to a job in the middle of its measurement: nothing confirmed may be lost, and no result changed or mixed.
+"""What happens to a job in the middle of its measurement: nothing is lost, no result changed.
 
 A part of four blocks is photographed (rendered) and measured once undisturbed. Then it is measured again for each event
 at each stage: the worker is killed or ended, the program updated, the tolerance edited, the CAD moved, the folder
@@ -89,9 +89,7 @@ def disturbed(event: str, folder: Path, job: JobFolder, worker: subprocess.Popen
     """Let an event happen; returns the jobs whose results are checked."""
     end_worker(worker, signal.SIGTERM if event == "SIGTERM" else signal.SIGKILL)
     if event == "edited":
-        (folder / "part.toml").write_text(
-            PART.replace('role = "base"', f'role = "base"\n[defaults]\nposition_tolerance_mm = {TOLERANCE_MM}')
-        )
+        (folder / "part.toml").write_text(PART.replace("mm = 1.5", f"mm = {TOLERANCE_MM}"))
     elif event == "moved":
         for path in folder.glob("*.obj"):
             path.rename(folder / "elsewhere")
