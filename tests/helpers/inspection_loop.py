@@ -275,7 +275,7 @@ class Inspector:
     def check_again(self, component: str, numbers: Sequence[int], by: str) -> Any:
         """Follow the rework instruction of a component and check it again; returns the re-check's document."""
         self.page.click(f"#job .component[data-name={component}]")
-        self.until(lambda: self.page.locator("#job .job-moves .move").count(), "the instruction")
+        self.until(lambda: self.page.locator("#job .job-moves .move, #job .job-steps input").count(), "the instruction")
         if self.page.locator("#job-tick-by").is_visible():
             self.page.fill("#job-tick-by", by)
         for box in self.page.locator("#job .job-steps input").all():

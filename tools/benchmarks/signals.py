@@ -26,6 +26,8 @@ ROOT = Path(__file__).resolve().parents[2]
 BRACKET, PLATE = ROOT / "samples" / "bracket_plate", ROOT / "samples" / "plate"
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 INTERRUPTED, FINISHED = 130, (0, 1, 2, 3)
+BEFORE_IT_BEGAN = tuple(-number for number in SIGNALS)
+"""Codes of a program that ends at once, while it is still being imported."""
 
 
 def annotate(folder: Path) -> list[str]:
@@ -92,7 +94,7 @@ def faults(folder: Path, code: int) -> list[str]:
                 check(path)
             except ArviewError as error:
                 found.append(f"{path.name}: {error}")
-    if code not in (INTERRUPTED, *FINISHED):
+    if code not in (INTERRUPTED, *FINISHED, *BEFORE_IT_BEGAN):
         found.append(f"exit code {code}")
     return found
 
