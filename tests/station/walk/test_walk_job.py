@@ -337,3 +337,12 @@ def test_a_signed_job_is_not_reopened(part: Part, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="is signed"):
         job.reopen()
     assert job.is_ended
+    # A check that begins after the signature is open; one that was signed is not.
+    check = job.recheck(["block"])
+    add(check, 2)
+    check.end()
+    assert not check.is_signed
+    check.reopen()
+    check.end()
+    decisions.sign_inspection(job.path, "Ada")
+    assert check.is_signed

@@ -291,8 +291,14 @@ class JobFolder:
 
     @property
     def is_signed(self) -> bool:
-        """Whether somebody has signed what was measured: nothing of it is changed any more."""
-        return any(entry.kind == "signature" for entry in decisions.log_of(self.path).entries())
+        """Whether somebody has signed what was measured: nothing of it is changed any more.
+
+        The log is that of the first measurement; of its signatures those count for a re-check that came after its end.
+        """
+        return any(
+            entry.kind == "signature" and (self.components is None or bool(self.ended and entry.time >= self.ended))
+            for entry in decisions.log_of(self.path).entries()
+        )
 
     # --- state and results -------------------------------------------------------------------------------
 
