@@ -271,7 +271,7 @@ def list_decisions(job: str, output: str | None) -> None:
     _told_state(job)
     if not content.entries:
         click.echo("not signed: nobody has decided anything")
-    if content.faults or quality.log_of(job).signature() is None:
+    if content.faults or (signed := quality.state_of_record(job).signature) is None or signed.void:
         click.get_current_context().exit(ExitCode.FAIL if content.faults else ExitCode.UNDECIDED)
 
 

@@ -353,3 +353,15 @@ def test_the_device_is_in_the_entry_and_in_the_hash(job: Path) -> None:
     path = log_of(job).path
     path.write_bytes(path.read_bytes().replace(b"iPhone", b"iPad  "))
     assert log_of(job).faults()
+
+
+def test_a_list_whose_signature_is_void_is_not_signed(job: Path) -> None:
+    unsigned = CliRunner().invoke(main, ["decisions", "list", str(job)])
+    assert unsigned.exit_code == 2 and "not signed" in unsigned.output
+    sign_inspection(job, "Grace", "as a concession")
+    assert CliRunner().invoke(main, ["decisions", "list", str(job)]).exit_code == 0
+    loaded = load_inspection(job / "inspection.json")
+    changed = replace(loaded.components[0], verdict=Verdict.UNDECIDED)
+    save_inspection(replace(loaded, components=(changed, *loaded.components[1:])), job / "inspection.json")
+    void = CliRunner().invoke(main, ["decisions", "list", str(job)])
+    assert void.exit_code == 2 and "void" in void.output
