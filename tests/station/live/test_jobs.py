@@ -389,7 +389,7 @@ def test_a_signature_at_the_verdict_holds_while_the_cloud_is_made(page: Http, se
     measured(on_disk(folder, job))
     on_disk(folder, job).write_state(replace(on_disk(folder, job).state(), cloud="running"))
     server.hub.desk.workers.ask(on_disk(folder, job))
-    assert page.json("POST", f"/api/jobs/{job}/sign", {"by": "Ada"})[0] == 201
+    assert page.json("POST", f"/api/jobs/{job}/sign", {"by": "Ada", "note": "reworked tomorrow"})[0] == 201
     assert page.json("GET", f"/api/jobs/{job}")[1]["signed"]["by"] == "Ada"
     path = on_disk(folder, job).path / "inspection.json"
     made = load_inspection(path)
@@ -467,7 +467,7 @@ def test_the_list_reads_no_inspection_and_signed_jobs_are_archived(
                 on_disk(tmp_path, job).write_state(replace(state, verdict="fail"))
             rows = page.json("GET", "/api/jobs")[1]["jobs"]
             assert [one["verdict"] for one in rows] == ["fail", "fail"]
-        assert page.json("POST", f"/api/jobs/{signed}/sign", {"by": "Ada"})[0] == 201
+        assert page.json("POST", f"/api/jobs/{signed}/sign", {"by": "Ada", "note": "scrapped"})[0] == 201
     old = time.time() - 40 * 86400
     for path in (tmp_path / "jobs" / signed, tmp_path / "jobs" / signed / "decisions.jsonl"):
         os.utime(path, (old, old))
