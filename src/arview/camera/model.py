@@ -99,7 +99,7 @@ class Camera:
     @property
     def is_distorted(self) -> bool:
         """True when any distortion term is not zero, or the lens has another model."""
-        return self.lens is not None or bool(np.any(self.dist != 0.0))
+        return self.lens is not None or bool(self.dist.any())
 
     @property
     def doubt(self) -> str:
@@ -164,19 +164,27 @@ class Camera:
     def scaled(self, width: int, height: int) -> Camera:
         """The camera for an image resized to width × height with the whole field of view."""
         sx, sy = width / self.width, height / self.height
-        return replace(
-            self,
-            width=width,
-            height=height,
-            fx=self.fx * sx,
-            fy=self.fy * sy,
-            cx=(self.cx + 0.5) * sx - 0.5,
-            cy=(self.cy + 0.5) * sy - 0.5,
-        )
+        return self._resized(width, height, sx, sy)
 
     def cropped(self, left: int, top: int, width: int, height: int) -> Camera:
         """The camera for a window of its image: width × height px, with (left, top) as the first pixel."""
-        return replace(self, width=width, height=height, cx=self.cx - left, cy=self.cy - top)
+        return self._changed(width=width, height=height, cx=self.cx - left, cy=self.cy - top)
+
+    def magnified(self, scale: float) -> Camera:
+        """The camera whose pixels are smaller than its own by exactly a scale; its size is rounded."""
+        return self._resized(round(self.width * scale), round(self.height * scale), scale, scale)
+
+    def _resized(self, width: int, height: int, sx: float, sy: float) -> Camera:
+        cx, cy = (self.cx + 0.5) * sx - 0.5, (self.cy + 0.5) * sy - 0.5
+        return self._changed(width=width, height=height, fx=self.fx * sx, fy=self.fy * sy, cx=cx, cy=cy)
+
+    def _changed(self, *, width: int, height: int, **values: float) -> Camera:
+        """The camera with other values, which are only checked in so far as they can be wrong: once per picture."""
+        if width <= 0 or height <= 0:
+            raise InputError(f"camera: image size {width}×{height} is not positive")
+        other = object.__new__(Camera)
+        other.__dict__.update(self.__dict__, width=width, height=height, **values)
+        return other
 
     def rotated(self, quarter_turns_clockwise: int) -> Camera:
         """The camera for an image turned clockwise by quarter turns, distortion included."""

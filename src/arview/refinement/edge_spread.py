@@ -40,7 +40,7 @@ def edge_spread(
     """Median standard deviation, px, of the blur of the part's edges at a pose; -1 where too few edges are seen.
 
     Args:
-        smooth: (H,W) uint8, smoothed over 3×3 pixels.
+        smooth: (H,W) uint8, `smoothed`.
         part: `ViewArrays`.
         cam_from_body: (4,4) pose, right to a few pixels.
         intrinsics: as of `intrinsics_of`.
@@ -53,6 +53,7 @@ def edge_spread(
     )
     kinds = part.edge_kinds[first:last:2]
     height, width = smooth.shape
+    pitch = intrinsics[10]
     size = 2 * SPREAD_REACH + 1
     profile = np.empty(size)
     spreads = np.empty(kinds.shape[0])
@@ -60,8 +61,8 @@ def edge_spread(
     for i in range(kinds.shape[0]):
         if lines.depths[i] <= 0 or (kinds[i] & (EDGE_CONTOUR | EDGE_SHARP)) == 0:
             continue
-        u, v = lines.pixels[i, 0], lines.pixels[i, 1]
-        nu, nv = lines.normals[i, 0], lines.normals[i, 1]
+        u, v = (lines.pixels[i, 0] + 0.5) * pitch - 0.5, (lines.pixels[i, 1] + 0.5) * pitch - 0.5
+        nu, nv = pitch * lines.normals[i, 0], pitch * lines.normals[i, 1]
         reach_x, reach_y = SPREAD_REACH * abs(nu) + 1.0, SPREAD_REACH * abs(nv) + 1.0
         if u - reach_x < 0 or v - reach_y < 0 or u + reach_x > width - 2 or v + reach_y > height - 2:
             continue

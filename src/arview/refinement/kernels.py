@@ -123,8 +123,9 @@ def run_stages(
         view = _project_view(part, pose, intrinsics, step_mm, stride)
         region = _measure_contour(image, colors, view, intrinsics[0], stages.region_scale[s], region_weight > 0)
         profiles = _measure_profiles(
-            gray, view, stages.edge_reach[s], stages.edge_step_px[s], weights.edge_threshold, edge_weight > 0
-        )
+            gray, view, stages.edge_reach[s], stages.edge_step_px[s], weights.edge_threshold, intrinsics[10],
+            is_used=edge_weight > 0,
+        )  # fmt: skip
         if edge_weight > 0 and weights.region > 0:
             weigh_by_color(image, colors, view.edge_lines, view.edge_kinds, profiles)
         trust = 1.0
@@ -187,11 +188,17 @@ def _measure_contour(
 
 @kernel
 def _measure_profiles(
-    gray: NDArray[np.uint8], view: ViewLines, reach: int, step_px: float, threshold: float, is_used: bool
+    gray: NDArray[np.uint8],
+    view: ViewLines,
+    reach: int,
+    step_px: float,
+    threshold: float,
+    pitch: float,
+    is_used: bool,
 ) -> EdgeProfiles:
     """`EdgeProfiles` of the edges; empty without the edge modality."""
     if is_used:
-        return measure_edges(gray, view.edge_lines, reach, step_px, threshold)
+        return measure_edges(gray, view.edge_lines, reach, step_px, threshold, pitch)
     return EdgeProfiles(np.zeros((0, HYPOTHESES)), np.zeros((0, HYPOTHESES)), np.zeros(0, dtype=np.bool_))
 
 
@@ -240,7 +247,7 @@ def run_evidence(
     lines = project_lines(
         part.edge_points[first:last], part.edge_tangents[first:last], True, cam_from_body, intrinsics, step_mm
     )
-    profiles = measure_edges(gray, lines, EVIDENCE_REACH, EVIDENCE_STEP_PX, edge_threshold)
+    profiles = measure_edges(gray, lines, EVIDENCE_REACH, EVIDENCE_STEP_PX, edge_threshold, intrinsics[10])
     edges = edge_evidence(profiles, part.edge_kinds[first:last], EVIDENCE_REACH * EVIDENCE_STEP_PX, tolerance_px)
     region_support, region_information = -1.0, 0.0
     if has_colors:
@@ -280,7 +287,7 @@ def run_edge_steps(
     lines = project_lines(
         part.edge_points[first:last], part.edge_tangents[first:last], True, cam_from_body, intrinsics, step_mm
     )
-    profiles = measure_edges(gray, lines, EVIDENCE_REACH, EVIDENCE_STEP_PX, edge_threshold)
+    profiles = measure_edges(gray, lines, EVIDENCE_REACH, EVIDENCE_STEP_PX, edge_threshold, intrinsics[10])
     positions, strengths = profiles.positions, profiles.strengths
     reach_px = EVIDENCE_REACH * EVIDENCE_STEP_PX
     chosen = profiles.visible & ((part.edge_kinds[first:last] & (EDGE_CONTOUR | EDGE_SHARP)) > 0)

@@ -53,15 +53,19 @@ class ViewArrays(NamedTuple):
     edge_kinds: NDArray[np.uint8]
 
 
-def intrinsics_of(camera: Camera) -> Array:
-    """Intrinsics in the form of the kernels: (10,) fx fy cx cy k1 k2 p1 p2 k3 is_distorted.
+def intrinsics_of(camera: Camera, pitch: float = 1.0) -> Array:
+    """Intrinsics in the form of the kernels: (11,) fx fy cx cy k1 k2 p1 p2 k3 is_distorted pitch.
+
+    The pitch is the size of the camera's pixels in pixels of the picture that is measured: below 1 in an enlarged
+    picture, of which only the pixels that are needed are interpolated.
 
     Raises:
         InputError: a camera with another lens model, which the kernels do not know.
     """
     if camera.lens is not None:
         camera = require_brown(camera, "tracking")
-    return np.array([camera.fx, camera.fy, camera.cx, camera.cy, *camera.dist, 1.0 if camera.is_distorted else 0.0])
+    is_distorted = 1.0 if camera.is_distorted else 0.0
+    return np.array([camera.fx, camera.fy, camera.cx, camera.cy, *camera.dist.tolist(), is_distorted, pitch])
 
 
 @kernel(inline=True)

@@ -174,7 +174,7 @@ class PictureRefiner:
 
     def __init__(self, refiner: PoseRefiner, picture: WorkingPicture) -> None:
         self.picture = picture
-        self.refiner = refiner.with_camera(picture.camera)
+        self.refiner = refiner.with_camera(picture.camera, picture.pitch)
 
     def matches(self, matches: TextureMatches | None) -> TextureMatches:
         """Texture matches of the frame in the pixels of the picture."""

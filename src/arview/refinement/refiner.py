@@ -147,10 +147,10 @@ class PoseRefiner:
         other.options, other._weights = replace(self.options, use_edge=False), self._weights._replace(edge=0.0)
         return other
 
-    def with_camera(self, camera: Camera) -> PoseRefiner:
-        """The same refiner for pictures of another camera, such as crops."""
-        other = copy.copy(self)
-        other.camera, other.intrinsics = camera, intrinsics_of(camera)
+    def with_camera(self, camera: Camera, pitch: float = 1.0) -> PoseRefiner:
+        """The same refiner for pictures of another camera, such as crops; for its pitch see `intrinsics_of`."""
+        other = object.__new__(PoseRefiner)
+        other.__dict__.update(self.__dict__, camera=camera, intrinsics=intrinsics_of(camera, pitch))
         return other
 
     def radius_px(self, cam_from_body: Array) -> float:

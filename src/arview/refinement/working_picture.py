@@ -87,7 +87,8 @@ class WorkingPicture(NamedTuple):
 
     Attributes:
         image: (h,w,3) uint8 RGB; empty in a picture made for edges only.
-        smooth: (h,w) uint8 grey levels, smoothed for the edge modality.
+        smooth: grey levels (h,w) uint8, smoothed for the edge modality; of an enlarged picture without colours they are
+            those of the window as it is.
         camera: intrinsics of the window at this scale.
         scale: of the window, relative to the picture.
         left, top, right, bottom: borders of the window in the picture, px.
@@ -106,6 +107,11 @@ class WorkingPicture(NamedTuple):
     def has_colors(self) -> bool:
         """Whether colours can be measured in it."""
         return self.image.shape[0] > 0
+
+    @property
+    def pitch(self) -> float:
+        """Size of the camera's pixels in pixels of ``smooth``."""
+        return 1.0 if self.has_colors else 1.0 / max(self.scale, 1.0)
 
     def covers(self, center: Array, reach_px: float, camera: Camera) -> bool:
         """Whether the window holds all that a picture of ``camera`` shows around a pixel (2,) within a reach."""
@@ -152,17 +158,21 @@ def working_picture(
     for _ in range(halvings):
         small = cv2.resize(small, (small.shape[1] // 2, small.shape[0] // 2), interpolation=cv2.INTER_AREA)
     rest = scale * unit
-    if abs(rest - 1.0) > 1e-6:
+    is_enlarged = scale > 1.0 and not has_colors
+    if abs(rest - 1.0) > 1e-6 and not is_enlarged:
         size = round(small.shape[1] * rest), round(small.shape[0] * rest)
         small = cv2.resize(small, size, interpolation=cv2.INTER_LINEAR)
     gray = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY) if has_colors else small
     colors = small if has_colors else np.zeros((0, 0, 3), dtype=np.uint8)
     is_whole = (left, top, right, bottom) == (0, 0, width, height)
     own = camera if is_whole else camera.cropped(left, top, right - left, bottom - top)
-    if scale != 1.0:
+    if is_enlarged:
+        own = own.magnified(scale)
+    elif scale != 1.0:
         own = own.scaled(gray.shape[1], gray.shape[0])
+    smooth = smoothed(np.asarray(gray), scale if is_enlarged else 1.0)
     return WorkingPicture(
-        np.asarray(colors), smoothed(np.asarray(gray)), own, scale=scale, left=left, top=top, right=right, bottom=bottom
+        np.asarray(colors), smooth, own, scale=scale, left=left, top=top, right=right, bottom=bottom
     )
 
 

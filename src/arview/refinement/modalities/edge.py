@@ -7,6 +7,7 @@ hypotheses. At every update of the pose each point uses the hypothesis with the 
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import cv2
@@ -47,23 +48,29 @@ class EdgeProfiles(NamedTuple):
     visible: NDArray[np.bool_]
 
 
-def smoothed(gray: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Grey picture (H,W) averaged over 3×3 pixels, the input of the edge modality."""
-    return np.asarray(cv2.blur(gray, (3, 3)))
+def smoothed(gray: NDArray[np.uint8], scale: float = 1.0) -> NDArray[np.uint8]:
+    """Grey picture (H,W), averaged over 3×3 pixels of a picture larger by a scale, the input of the edge modality."""
+    if scale <= 1.0:
+        return np.asarray(cv2.blur(gray, (3, 3)))
+    # Three pixels in a row with the variance of the average of three smaller ones.
+    outer = 1.0 / (3.0 * scale * scale)
+    sigma_px = math.sqrt(-0.5 / math.log(outer / (1.0 - 2.0 * outer)))
+    return np.asarray(cv2.GaussianBlur(gray, (3, 3), sigma_px))
 
 
 @kernel
 def measure_edges(
-    gray: NDArray[np.uint8], lines: ProjectedLines, reach: int, step_px: float, threshold: float
+    gray: NDArray[np.uint8], lines: ProjectedLines, reach: int, step_px: float, threshold: float, pitch: float
 ) -> EdgeProfiles:
     """Grey-level steps along the normal of each point, see `EdgeProfiles`.
 
     Args:
-        gray: (H,W) uint8, smoothed over 3×3, which replaces averaging over neighbouring profiles.
+        gray: (H,W) uint8, `smoothed`, which replaces averaging over neighbouring profiles.
         lines: `ProjectedLines` of the points.
         reach: samples to either side.
         step_px: distance between samples.
         threshold: weakest step, grey levels over two samples.
+        pitch: of the points' pixels, see `intrinsics_of`.
     """
     pixels, normals, depths = lines.pixels, lines.normals, lines.depths
     height, width = gray.shape
@@ -77,14 +84,14 @@ def measure_edges(
     for i in range(count):
         if depths[i] <= 0:
             continue
-        u, v = pixels[i, 0], pixels[i, 1]
+        u, v = (pixels[i, 0] + 0.5) * pitch - 0.5, (pixels[i, 1] + 0.5) * pitch - 0.5
         nu, nv = normals[i, 0], normals[i, 1]
         if u < 2 or v < 2 or u > width - 4 or v > height - 4:
             continue
         first, last = 0, size - 1
         half = 0.5 * (size - 1)
         for k in range(size):
-            t = (k - half) * step_px
+            t = (k - half) * step_px * pitch
             x = u + t * nu
             y = v + t * nv
             ix, iy = int(x), int(y)

@@ -192,7 +192,7 @@ class FocalAdjustment:
         points, tangents, kinds = arrays.edge_points[chosen], arrays.edge_tangents[chosen], arrays.edge_kinds[chosen]
         lines = project_lines(points, tangents, True, pose, frame.intrinsics(camera), 0.01 * self._diameter_mm)
         reach = max(5, round(min(REACH, 2.5 * spread_px + 2.0)))
-        profiles = measure_edges(frame.gray, lines, reach, STEP_PX, THRESHOLD)
+        profiles = measure_edges(frame.gray, lines, reach, STEP_PX, THRESHOLD, 1.0)
         return _Measured(points, tangents, kinds, lines, profiles)
 
     def _equations(
