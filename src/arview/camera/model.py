@@ -118,12 +118,21 @@ class Camera:
     def project(self, points_in_cam: ArrayLike) -> Array:
         """Pixels (..., 2) of points (..., 3) in the camera frame; NaN for points not in front of the camera."""
         points = np.asarray(points_in_cam, dtype=np.float64)
+        if points.ndim == 1 and self.lens is None:
+            return self._project_one(*points.tolist())
         z = points[..., 2]
         with np.errstate(divide="ignore", invalid="ignore"):
             x = np.where(z > 0, points[..., 0] / z, np.nan)
             y = np.where(z > 0, points[..., 1] / z, np.nan)
         x, y = self.distort(x, y)
         return np.stack([self.fx * x + self.cx, self.fy * y + self.cy], axis=-1)
+
+    def _project_one(self, x: float, y: float, z: float) -> Array:
+        """As `project`, of one point: without numpy's overhead, because it is done several times in a frame."""
+        if not z > 0.0:
+            return np.array([np.nan, np.nan])
+        x, y = self.distort(x / z, y / z)  # type: ignore[arg-type, assignment]
+        return np.array([self.fx * x + self.cx, self.fy * y + self.cy])
 
     def slopes(self, points_in_cam: Array) -> Array:
         """(N,2,3) derivatives of the pixels of points (N,3) in the camera frame, px by the points' unit.
@@ -139,7 +148,7 @@ class Camera:
         """Distorted normalised coordinates of ideal ones (Brown 1966, OpenCV's formula; or the lens model)."""
         if self.lens is not None:
             return self.lens.distort(x, y)
-        k1, k2, p1, p2, k3 = self.dist
+        k1, k2, p1, p2, k3 = self.dist.tolist()
         r2 = x * x + y * y
         radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
         xd = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)

@@ -268,7 +268,7 @@ class PoseRefiner:
             EDGE_THRESHOLD,
             tolerance_px,
         )
-        return PoseEvidence(**terms._asdict())
+        return PoseEvidence(*terms)
 
     def edge_spread_px(self, gray: NDArray[np.uint8], cam_from_body: Array) -> float | None:
         """Standard deviation of the blur of the part's edges at a pose (4,4); None where too few are seen."""

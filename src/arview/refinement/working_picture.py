@@ -9,6 +9,7 @@ larger part the same reach is narrower, which keeps other edges beside the right
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -62,8 +63,8 @@ class WorkingScaleOptions:
         finest = min(self.max_enlargement, FINE_RADIUS_PX / radius_px)
         if spread_px * finest > MAX_FINE_SPREAD_PX:
             finest = MAX_FINE_SPREAD_PX / spread_px
-        first, last = np.log2(self.working_scale(radius_px, spread_px)), self._quantised(np.log2(finest))
-        count = max(0, int(np.ceil((last - first) / np.log2(LEVEL_RATIO) - 1e-6)))
+        first, last = math.log2(self.working_scale(radius_px, spread_px)), self._quantised(math.log2(finest))
+        count = max(0, math.ceil((last - first) / math.log2(LEVEL_RATIO) - 1e-6))
         between = [self._quantised(first + k * (last - first) / count) for k in range(1, count)]
         return tuple(float(2.0**x) for x in (first, *between, *([last] if count else [])))
 
@@ -72,11 +73,11 @@ class WorkingScaleOptions:
         scale = min(1.0, self.radius_px / radius_px)
         if spread_px * scale > MAX_SPREAD_PX:
             scale = max(MAX_SPREAD_PX / spread_px, min(scale, SOFT_RADIUS_PX / radius_px))
-        return float(2.0 ** self._quantised(np.log2(scale)))
+        return float(2.0 ** self._quantised(math.log2(scale)))
 
     def _quantised(self, octaves: float) -> float:
         """The nearest scale of the series; both are logarithms to base 2."""
-        return float(np.round(octaves * STEPS_PER_OCTAVE) / STEPS_PER_OCTAVE)
+        return round(octaves * STEPS_PER_OCTAVE) / STEPS_PER_OCTAVE
 
 
 DEFAULT = WorkingScaleOptions()
@@ -143,14 +144,20 @@ def working_picture(
     """
     height, width = image.shape[:2]
     # Windows whose sides are multiples of the halvings are reduced by exactly two at each of them.
-    halvings = max(0, int(np.floor(-np.log2(scale) + 1e-6)))
+    halvings = max(0, math.floor(-math.log2(scale) + 1e-6))
     unit = 2**halvings
     left, top, right, bottom = 0, 0, width, height
-    if window is not None and np.all(np.isfinite(window)):
-        first = np.clip(np.floor(np.array(window[:2]) / unit).astype(np.int64) * unit, 0, (width, height))
-        last = np.clip(np.ceil(np.array(window[2:]) / unit).astype(np.int64) * unit, 0, (width, height))
-        if np.all(last - first >= max(16, 16 / scale)):
-            left, top, right, bottom = int(first[0]), int(first[1]), int(last[0]), int(last[1])
+    if window is not None and all(map(math.isfinite, window)):
+        first = [
+            min(max(math.floor(value / unit) * unit, 0), size)
+            for value, size in zip(window[:2], (width, height), strict=True)
+        ]
+        last = [
+            min(max(math.ceil(value / unit) * unit, 0), size)
+            for value, size in zip(window[2:], (width, height), strict=True)
+        ]
+        if min(last[0] - first[0], last[1] - first[1]) >= max(16, 16 / scale):
+            (left, top), (right, bottom) = first, last
     right, bottom = left + (right - left) // unit * unit, top + (bottom - top) // unit * unit
     small = image[top:bottom, left:right]
     if not has_colors:
@@ -171,9 +178,7 @@ def working_picture(
     elif scale != 1.0:
         own = own.scaled(gray.shape[1], gray.shape[0])
     smooth = smoothed(np.asarray(gray), scale if is_enlarged else 1.0)
-    return WorkingPicture(
-        np.asarray(colors), smooth, own, scale=scale, left=left, top=top, right=right, bottom=bottom
-    )
+    return WorkingPicture(np.asarray(colors), smooth, own, scale=scale, left=left, top=top, right=right, bottom=bottom)
 
 
 def matches_in(picture: WorkingPicture, matches: TextureMatches) -> TextureMatches:
@@ -201,9 +206,8 @@ def window_around(
     """
     if any(pose[2, 3] <= 0 for pose in poses):
         return None
-    centers = np.array([camera.project(pose[:3, 3]) for pose in poses])
-    if not np.all(np.isfinite(centers)):
+    us, vs = zip(*(camera.project(pose[:3, 3]).tolist() for pose in poses), strict=True)
+    if not all(map(math.isfinite, (*us, *vs))):
         return None
     around = reach * 0.5 * diameter_mm * camera.fx / min(float(pose[2, 3]) for pose in poses) + margin_px
-    first, last = centers.min(axis=0) - around, centers.max(axis=0) + around
-    return float(first[0]), float(first[1]), float(last[0]) + 1.0, float(last[1]) + 1.0
+    return min(us) - around, min(vs) - around, max(us) + around + 1.0, max(vs) + around + 1.0

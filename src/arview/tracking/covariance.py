@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
+from arview.core.kernel import kernel
 from arview.geometry import Array
 
 POINTS_BETWEEN_FRAMES, POINTS_OF_FRAME = 8.0, 4.0
@@ -18,6 +17,7 @@ MOTION_SHIFT, MOTION_SIZE = 0.1, 0.05
 """Shares of the motion since the last frame by which they grow: blur and rolling shutter move all points alike."""
 
 
+@kernel
 def covariance_of(information: Array, quality: float, diameter_mm: float, correlated_points: float) -> Array:
     """Covariance (6,6) of a twist (rad, mm) for an information (6,6) and the quality of its pose.
 
@@ -25,11 +25,13 @@ def covariance_of(information: Array, quality: float, diameter_mm: float, correl
     radian and half a diameter.
     """
     scale = correlated_points / max(quality, 0.05)
-    max_sigma = np.array([0.5] * 3 + [0.5 * diameter_mm] * 3)
-    covariance = np.linalg.inv(information / scale + np.diag(1.0 / max_sigma**2))
-    return np.asarray(covariance, dtype=np.float64)
+    total = information / scale
+    for i in range(6):
+        total[i, i] += 4.0 if i < 3 else 4.0 / diameter_mm**2
+    return np.linalg.inv(total)
 
 
+@kernel
 def common_covariance(cam_from_body: Array, radius_px: float, diameter_mm: float, motion: Array) -> Array:
     """Covariance (6,6) of the errors that all points of a frame share.
 
@@ -39,14 +41,17 @@ def common_covariance(cam_from_body: Array, radius_px: float, diameter_mm: float
         diameter_mm: of the part.
         motion: (6,) twist (rad, mm) of the part since the last frame.
     """
-    distance_mm, mm_per_px = max(float(cam_from_body[2, 3]), 1.0), 0.5 * diameter_mm / radius_px
-    shift_mm = cam_from_body[:3, :3] @ motion[3:]
-    turned_px = radius_px * float(np.linalg.norm([*motion[:3], shift_mm[2] / distance_mm]))
-    motion_px = math.hypot(turned_px, *(shift_mm[:2] / mm_per_px))
-    shift_px = math.hypot(COMMON_SHIFT_PX, MOTION_SHIFT * motion_px)
-    turn_rad = math.hypot(COMMON_SIZE_PX, MOTION_SIZE * motion_px) / radius_px
+    r = cam_from_body
+    distance_mm, mm_per_px = max(r[2, 3], 1.0), 0.5 * diameter_mm / radius_px
+    shift_mm = r[:3, :3] @ motion[3:]
+    turned_px = radius_px * np.sqrt((motion[:3] * motion[:3]).sum() + (shift_mm[2] / distance_mm) ** 2)
+    motion_px = np.sqrt(turned_px**2 + (shift_mm[0] / mm_per_px) ** 2 + (shift_mm[1] / mm_per_px) ** 2)
+    shift_px = np.hypot(COMMON_SHIFT_PX, MOTION_SHIFT * motion_px)
+    turn_rad = np.hypot(COMMON_SIZE_PX, MOTION_SIZE * motion_px) / radius_px
     covariance = np.zeros((6, 6))
-    covariance[:3, :3] = turn_rad**2 * np.eye(3)
-    axes = np.diag(np.square([shift_px * mm_per_px, shift_px * mm_per_px, turn_rad * distance_mm]))
-    covariance[3:, 3:] = cam_from_body[:3, :3].T @ axes @ cam_from_body[:3, :3]
+    for i in range(3):
+        covariance[i, i] = turn_rad**2
+        for j in range(3):
+            across = (shift_px * mm_per_px) ** 2 * (r[0, i] * r[0, j] + r[1, i] * r[1, j])
+            covariance[3 + i, 3 + j] = across + (turn_rad * distance_mm) ** 2 * r[2, i] * r[2, j]
     return covariance

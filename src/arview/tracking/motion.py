@@ -11,7 +11,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from arview.geometry import Array, log_so3, rotation_angle_rad
+from arview.core.kernel import kernel
+from arview.geometry import Array
 
 ROTATION_UNIT_RAD = 0.785
 """Rotation that has a distance of 1."""
@@ -19,53 +20,68 @@ LATERAL_UNIT, AXIAL_UNIT = 0.35, 0.7
 """Shifts across and along the line of sight, in diameters of the part, that have a distance of 1."""
 
 
+@kernel
 def squared_motion_distance(cam_from_body: Array, predicted: Array, diameter_mm: float) -> float:
-    """Squared normalised distance of a pose from the predicted pose.
+    """Squared normalised distance of a pose from the predicted pose, the square of the length of `innovation`.
 
     It is 1 for a rotation of 45°, a lateral shift of 0.35 diameters or an axial shift of 0.7 diameters.
-
-    Args:
-        cam_from_body: (4,4) pose about the part's centre.
-        predicted: (4,4) predicted pose about the part's centre.
-        diameter_mm: diameter of the part.
     """
-    rotation = float(rotation_angle_rad(cam_from_body, predicted)) / ROTATION_UNIT_RAD
-    shift = (cam_from_body[:3, 3] - predicted[:3, 3]) / (LATERAL_UNIT * diameter_mm)
-    return float(rotation**2 + shift[0] ** 2 + shift[1] ** 2 + (LATERAL_UNIT / AXIAL_UNIT) ** 2 * shift[2] ** 2)
+    difference = innovation(cam_from_body, predicted, diameter_mm)
+    return float((difference * difference).sum())
 
 
+@kernel
 def innovation(cam_from_body: Array, predicted: Array, diameter_mm: float) -> Array:
     """Normalised difference (6,) of a pose from the predicted pose, in the camera frame.
 
-    Rotation and shift are in the units of `squared_motion_distance`, which is the square of its length.
-
     Args:
         cam_from_body: (4,4) pose about the part's centre.
         predicted: (4,4) predicted pose about the part's centre.
         diameter_mm: diameter of the part.
     """
-    rotation = log_so3(cam_from_body[:3, :3] @ predicted[:3, :3].T)
-    return np.concatenate([rotation, cam_from_body[:3, 3] - predicted[:3, 3]]) / _units(diameter_mm)
+    a, b = cam_from_body, predicted
+    turn = np.zeros((3, 3))
+    for i in range(3):
+        for j in range(3):
+            turn[i, j] = a[i, 0] * b[j, 0] + a[i, 1] * b[j, 1] + a[i, 2] * b[j, 2]
+    difference = np.empty(6)
+    difference[0] = 0.5 * (turn[2, 1] - turn[1, 2])
+    difference[1] = 0.5 * (turn[0, 2] - turn[2, 0])
+    difference[2] = 0.5 * (turn[1, 0] - turn[0, 1])
+    sine = np.sqrt((difference[:3] * difference[:3]).sum())
+    cosine = 0.5 * (turn[0, 0] + turn[1, 1] + turn[2, 2] - 1.0)
+    if sine > 1e-6:
+        difference[:3] *= np.arctan2(sine, cosine) / sine
+    elif cosine < 0.0:
+        difference[0] = np.pi  # half a turn, about whichever axis
+    for i in range(3):
+        difference[i] /= ROTATION_UNIT_RAD
+        difference[3 + i] = (a[i, 3] - b[i, 3]) / (diameter_mm * (AXIAL_UNIT if i == 2 else LATERAL_UNIT))
+    return difference
 
 
+@kernel
 def normalised_covariance(covariance: Array, cam_from_body: Array, diameter_mm: float) -> Array:
     """Covariance (6,6) of a twist (rad, mm) on the right of a pose (4,4), in the frame and units of `innovation`."""
     turn = np.zeros((6, 6))
-    turn[:3, :3] = turn[3:, 3:] = cam_from_body[:3, :3]
-    turn /= _units(diameter_mm)[:, None]
-    return np.asarray(turn @ covariance @ turn.T)
+    for i in range(3):
+        for j in range(3):
+            turn[i, j] = cam_from_body[i, j] / ROTATION_UNIT_RAD
+            turn[3 + i, 3 + j] = cam_from_body[i, j] / (diameter_mm * (AXIAL_UNIT if i == 2 else LATERAL_UNIT))
+    return turn @ covariance @ turn.T
 
 
-def _units(diameter_mm: float) -> Array:
-    """Units (6,) of an innovation: rad and mm."""
-    shifts = np.array([LATERAL_UNIT, LATERAL_UNIT, AXIAL_UNIT]) * diameter_mm
-    return np.concatenate([np.full(3, ROTATION_UNIT_RAD), shifts])
+@kernel
+def _squared_mahalanobis(difference: Array, covariance: Array) -> float:
+    """Squared Mahalanobis distance of a difference (6,) with a covariance (6,6)."""
+    return float((difference * np.linalg.solve(covariance, difference)).sum())
 
 
 PRIOR_SIGMA = 0.03
 """Standard deviation of each component before anything is learned: a steady hand."""
 MIN_SIGMA = 0.012
 """Standard deviation of the measured poses themselves, which is added."""
+NOISE = MIN_SIGMA**2 * np.eye(6)
 RATE = 0.05
 """Share by which the covariance follows each frame."""
 MAX_SQUARED = 10.0
@@ -99,7 +115,7 @@ class MotionModel:
     @property
     def covariance(self) -> Array:
         """Covariance (6,6) of the usual innovations, with the noise of the measured poses."""
-        return self._covariance + MIN_SIGMA**2 * np.eye(6)
+        return self._covariance + NOISE
 
     @property
     def is_calm(self) -> bool:
@@ -119,7 +135,7 @@ class MotionModel:
             pose_covariance: (6,6) of `normalised_covariance`, of the pose that was measured.
         """
         covariance = self.covariance if pose_covariance is None else self.covariance + pose_covariance
-        return float(difference @ np.linalg.solve(covariance, difference))
+        return float(_squared_mahalanobis(difference, covariance))
 
     def is_unusual(self, difference: Array, pose_covariance: Array) -> bool:
         """Whether an innovation (6,) is neither usual in this stream nor explained by the covariance of the pose."""

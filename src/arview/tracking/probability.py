@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from arview.core.kernel import kernel
 from arview.geometry import Array
 from arview.tracking.estimate import Estimate
 from arview.weights import load_weights
@@ -57,8 +58,8 @@ def pose_features(estimate: Estimate, covariance: Array, diameter_mm: float) -> 
     evidence = estimate.evidence
     share = min(0.5, evidence.inner_share)
     colours = max(evidence.region_support, 0.0)
-    sigma_deg = math.degrees(_max_sigma(covariance[:3, :3]))
-    sigma_share = _max_sigma(covariance[3:, 3:]) / diameter_mm
+    sigma_rad, sigma_mm = _max_sigmas(covariance)
+    sigma_deg, sigma_share = math.degrees(sigma_rad), sigma_mm / diameter_mm
     return PoseFeatures(
         outline=0.6 * evidence.contour_support + 0.4 * evidence.sharpness,
         inner=share * (evidence.inner_support - 0.5),
@@ -80,8 +81,11 @@ def pose_probability(features: PoseFeatures) -> float:
     return 1.0 / (1.0 + math.exp(-max(min(logit, 50.0), -50.0)))
 
 
-def _max_sigma(covariance: Array) -> float:
-    return math.sqrt(max(float(np.linalg.eigvalsh(covariance)[-1]), 0.0))
+@kernel
+def _max_sigmas(covariance: Array) -> tuple[float, float]:
+    """Largest standard deviations of rotation, rad, and translation, mm, of a covariance (6,6)."""
+    turn, shift = np.linalg.eigvalsh(covariance[:3, :3].copy())[2], np.linalg.eigvalsh(covariance[3:, 3:].copy())[2]
+    return np.sqrt(max(turn, 0.0)), np.sqrt(max(shift, 0.0))
 
 
 @cache

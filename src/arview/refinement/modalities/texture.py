@@ -23,7 +23,14 @@ from arview.refinement.modalities.patch_alignment import (
     Pyramid,
     build_pyramid,
 )
-from arview.refinement.modalities.texture_matching import MatchSettings, align_pose, match_texture
+from arview.refinement.modalities.texture_matching import (
+    MIN_TRUST,
+    MatchSettings,
+    align_pose,
+    learn_trust,
+    match_texture,
+    nearest_pose,
+)
 from arview.refinement.projection import intrinsics_of
 from arview.rendering import RayCaster
 
@@ -33,22 +40,10 @@ CHECK_OCCLUSION = True
 """Test by a ray from each point to the camera whether the part hides it."""
 NEIGHBOUR_PX = 3.0
 """Largest deviation from the median displacement of the nearest neighbours."""
-VIEW_STEP_RAD = 0.17
-"""Difference in direction of view that asks for a new keyframe."""
-ROLL_STEP_RAD = 0.26
-"""Difference in roll that asks for a new keyframe."""
-SCALE_STEP = 0.15
-"""Relative difference in distance that asks for a new keyframe."""
 MAX_KEYFRAMES = 12
 """Keyframes kept; the least recently used is dropped beyond."""
 REPLACE_DISTANCE = 0.3
 """A keyframe nearer than this to a new one, in the steps above, is replaced by it."""
-MIN_TRUST = 0.2
-"""Trust below which a corner is no longer used."""
-TRUST_RATE = 0.1
-"""Share by which a corner's trust follows each frame."""
-TRUSTED_PX = 2.0
-"""Distance from where the pose places it within which a found corner gains trust."""
 
 
 class TextureMatches(NamedTuple):
@@ -117,17 +112,8 @@ class TextureModality:
         """Keyframe nearest in direction of view, roll and distance, and its distance in the steps of the options."""
         if not self.keyframes:
             return None, np.inf
-        poses = np.stack([keyframe.cam_from_body for keyframe in self.keyframes])
-        eyes = np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
-        eye = cam_from_body[:3, 3] @ cam_from_body[:3, :3]
-        ranges, distance = np.linalg.norm(eyes, axis=1), np.linalg.norm(eye)
-        view = np.arccos(np.clip(eyes @ eye / (ranges * distance), -1.0, 1.0))
-        turn = np.einsum("ik,njk->nij", cam_from_body[:3, :3], poses[:, :3, :3])
-        roll = np.abs(np.arctan2(turn[:, 1, 0] - turn[:, 0, 1], turn[:, 0, 0] + turn[:, 1, 1]))
-        scale = np.abs(np.log(distance / ranges)) / np.log1p(SCALE_STEP)
-        steps = np.maximum(np.maximum(view / VIEW_STEP_RAD, roll / ROLL_STEP_RAD), scale)
-        best = int(np.argmin(steps))
-        return self.keyframes[best], float(steps[best])
+        best, steps = nearest_pose(np.stack([keyframe.cam_from_body for keyframe in self.keyframes]), cam_from_body)
+        return self.keyframes[best], steps
 
     def wants_keyframe(self, cam_from_body: Array, tracked_count: int) -> bool:
         """Whether a keyframe at a pose (4,4) would help.
@@ -225,14 +211,8 @@ class TextureModality:
         if self._last is None:
             return
         keyframe, found, pixels = self._last
-        trust = keyframe.anchors.trust
-        points = keyframe.anchors.points[found] @ cam_from_body[:3, :3].T + cam_from_body[:3, 3]
-        with np.errstate(invalid="ignore"):
-            good = np.linalg.norm(self.camera.project(points) - pixels, axis=1) <= TRUSTED_PX
-        # When most corners disagree, the pose may be wrong.
-        if 2 * np.count_nonzero(good) < len(found):
-            return
-        trust[found] += TRUST_RATE * (good - trust[found])
-        if np.count_nonzero(trust >= MIN_TRUST) < MIN_CORNERS and keyframe in self.keyframes:
+        anchors = keyframe.anchors
+        trusted = learn_trust(anchors.trust, anchors.points, found, pixels, cam_from_body, self._intrinsics)
+        if trusted < MIN_CORNERS and keyframe in self.keyframes:
             self.keyframes.remove(keyframe)
         self._last = None

@@ -41,6 +41,18 @@ class PatchMatches(NamedTuple):
     expected: NDArray[np.bool_]
 
 
+VIEW_STEP_RAD = 0.17
+"""Difference in direction of view that asks for a new keyframe."""
+ROLL_STEP_RAD = 0.26
+"""Difference in roll that asks for a new keyframe."""
+SCALE_STEP = 0.15
+"""Relative difference in distance that asks for a new keyframe."""
+MIN_TRUST = 0.2
+"""Trust below which a corner is no longer used."""
+TRUST_RATE = 0.1
+"""Share by which a corner's trust follows each frame."""
+TRUSTED_PX = 2.0
+"""Distance from where the pose places it within which a found corner gains trust."""
 NEIGHBOURS = 7
 """Nearest neighbours with which the displacement of a patch is compared."""
 PATCH_SIDE = 9
@@ -363,3 +375,65 @@ def match_texture(
             weights[i] = (scores[i] - min_ncc) / (1.0 - min_ncc)
     _agree_with_neighbours(predicted, pixels, weights, settings.neighbour_px)
     return PatchMatches(pixels, weights, expected)
+
+
+@kernel
+def nearest_pose(poses: NDArray[np.float64], cam_from_body: NDArray[np.float64]) -> tuple[int, float]:
+    """Pose (N,4,4) nearest in direction of view, roll and distance, and its distance in the steps for new keyframes."""
+    best, least = 0, np.inf
+    b = cam_from_body
+    eye = b[:3, :3].T @ b[:3, 3]
+    distance = np.sqrt((eye * eye).sum())
+    for k in range(poses.shape[0]):
+        a = poses[k]
+        other = a[:3, :3].T @ a[:3, 3]
+        range_mm = np.sqrt((other * other).sum())
+        view = np.arccos(min(max((eye * other).sum() / (range_mm * distance), -1.0), 1.0))
+        turn = b[:3, :3] @ a[:3, :3].T
+        roll = abs(np.arctan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1]))
+        scale = abs(np.log(distance / range_mm)) / np.log(1.0 + SCALE_STEP)
+        steps = max(view / VIEW_STEP_RAD, roll / ROLL_STEP_RAD, scale)
+        if steps < least:
+            best, least = k, steps
+    return best, least
+
+
+@kernel
+def learn_trust(
+    trust: NDArray[np.float64],
+    points: NDArray[np.float64],
+    found: NDArray[np.int64],
+    pixels: NDArray[np.float64],
+    cam_from_body: NDArray[np.float64],
+    intrinsics: NDArray[np.float64],
+) -> int:
+    """Move the trust (N,) in those corners that were found towards whether they are where a pose places them.
+
+    Args:
+        trust: in place.
+        points: (N,3) of the corners in the body frame.
+        found: (M,) indices of those that were found.
+        pixels: (M,2) where.
+        cam_from_body: (4,4) accepted pose.
+        intrinsics: as of `intrinsics_of`.
+
+    Returns:
+        Number of corners with enough trust. When most that were found disagree, the pose may be wrong, and nothing is
+        learned: all corners are counted.
+    """
+    good = np.zeros(found.shape[0])
+    for k in range(found.shape[0]):
+        p = points[found[k]]
+        x, y, z = to_camera(cam_from_body, p[0], p[1], p[2])
+        if z >= 1.0:
+            u, v = project(x, y, z, intrinsics)
+            good[k] = 1.0 if (u - pixels[k, 0]) ** 2 + (v - pixels[k, 1]) ** 2 <= TRUSTED_PX**2 else 0.0
+    if 2.0 * good.sum() < found.shape[0]:
+        return trust.shape[0]
+    for k in range(found.shape[0]):
+        trust[found[k]] += TRUST_RATE * (good[k] - trust[found[k]])
+    count = 0
+    for one in trust:
+        if one >= MIN_TRUST:
+            count += 1
+    return count
