@@ -20,12 +20,17 @@ from arview.rendering import EDGE_CONTOUR, EDGE_SHARP
 
 STRENGTH_HALF = 15.0
 """Strength of an edge step, in grey levels over two pixels, that has half the weight of a very strong one."""
+SETTLED_PX = 0.1
+"""Last move of the part, px of the picture, up to which no stage follows that would begin anew with coarser ones."""
 EVIDENCE_REACH, EVIDENCE_STEP_PX = 10, 1.0
 """Samples to either side of an edge, and their distance, in the profiles of the evidence."""
 EVIDENCE_SCALE, EVIDENCE_REGION_PX = 2, 2.0
 """Pixels per segment, and tolerated displacement, of the lines across the outline in the evidence."""
 HISTOGRAM_REACH_PX, HISTOGRAM_GAP_PX = 20.0, 1.5
 """Pixels counted to either side of the outline, and left out beside it, in the colour histograms."""
+
+STEP_SHARE = 0.01
+"""Length, in diameters, by which the projections of normals and tangents are measured."""
 
 
 class ModalityWeights(NamedTuple):
@@ -115,6 +120,7 @@ def run_stages(
     pose = cam_from_body.copy()
     hessian = np.zeros((6, 6))
     gradient = np.zeros(6)
+    twist = np.zeros(6)
     for s in range(stages.stride.shape[0]):
         stride = stages.stride[s]
         region_weight = weights.region * stages.region_gain[s] * stride
@@ -151,10 +157,24 @@ def run_stages(
                     hessian, gradient, matches.points_in_body, pose, intrinsics, matches.pixels, matches.weights,
                     weights.texture_sigma_px, max(4.0, 2.0 * spread_px),
                 )  # fmt: skip
-            pose = apply_twist(pose, solve_step(hessian, gradient, damping))
+            twist = solve_step(hessian, gradient, damping)
+            pose = apply_twist(pose, twist)
+        is_finest = s + 1 < stages.stride.shape[0] and stages.edge_spread_px[s + 1] > spread_px
+        if is_finest and _move_px(twist, pose, intrinsics, step_mm) < SETTLED_PX:
+            break
     _fill_upper(hessian)
     _orthonormalize(pose)
     return pose, hessian
+
+
+@kernel
+def _move_px(
+    twist: NDArray[np.float64], pose: NDArray[np.float64], intrinsics: NDArray[np.float64], step_mm: float
+) -> float:
+    """Largest move of a point of the part in the picture by a twist (6,)."""
+    radius_mm = 0.5 * step_mm / STEP_SHARE
+    turn, shift = (twist[:3] * twist[:3]).sum(), (twist[3:] * twist[3:]).sum()
+    return intrinsics[0] / max(pose[2, 3], 1.0) * (np.sqrt(turn) * radius_mm + np.sqrt(shift))
 
 
 @kernel
@@ -235,20 +255,21 @@ def run_evidence(
     step_mm: float,
     edge_threshold: float,
     tolerance_px: float,
+    stride: int,
 ) -> EvidenceTerms:
     """`EvidenceTerms` of the picture for a pose; arguments as of `run_stages`.
 
     Args:
         has_colors: whether ``colors`` have been learned.
         tolerance_px: steps at most this far from an edge support it.
+        stride: every n-th edge point is measured.
     """
     view = nearest_view(part.directions, cam_from_body)
     first, last = part.edge_starts[view], part.edge_starts[view + 1]
-    lines = project_lines(
-        part.edge_points[first:last], part.edge_tangents[first:last], True, cam_from_body, intrinsics, step_mm
-    )
+    points, tangents = part.edge_points[first:last:stride], part.edge_tangents[first:last:stride]
+    lines = project_lines(points, tangents, True, cam_from_body, intrinsics, step_mm)
     profiles = measure_edges(gray, lines, EVIDENCE_REACH, EVIDENCE_STEP_PX, edge_threshold, intrinsics[10])
-    edges = edge_evidence(profiles, part.edge_kinds[first:last], EVIDENCE_REACH * EVIDENCE_STEP_PX, tolerance_px)
+    edges = edge_evidence(profiles, part.edge_kinds[first:last:stride], EVIDENCE_REACH * EVIDENCE_STEP_PX, tolerance_px)
     region_support, region_information = -1.0, 0.0
     if has_colors:
         first, last = part.contour_starts[view], part.contour_starts[view + 1]

@@ -93,7 +93,7 @@ class RefinementPyramid:
         evidence = self.working.evidence(cam_from_body, appearance)
         if len(self.scales) == 1:
             return PoseScores(evidence, evidence.score)
-        return PoseScores(evidence, self.finest.evidence(cam_from_body, appearance).score)
+        return PoseScores(evidence, self.finest.evidence(cam_from_body, appearance, stride=2).score)
 
     def cover(self, poses: Sequence[Array]) -> None:
         """Make all pictures show the part at some other poses (4,4), too."""
@@ -185,10 +185,10 @@ class PictureRefiner:
         gray = np.asarray(cv2.cvtColor(self.picture.image, cv2.COLOR_RGB2GRAY))
         return self.refiner.refine_shading(gray, cam_from_body, information)
 
-    def evidence(self, cam_from_body: Array, appearance: Appearance) -> PoseEvidence:
-        """Evidence of the picture for a pose (4,4)."""
+    def evidence(self, cam_from_body: Array, appearance: Appearance, stride: int = 1) -> PoseEvidence:
+        """Evidence of the picture for a pose (4,4), of every n-th edge point."""
         used = appearance if self.picture.has_colors else NO_COLORS
-        return self.refiner.evidence(self.picture.image, self.picture.smooth, cam_from_body, used)
+        return self.refiner.evidence(self.picture.image, self.picture.smooth, cam_from_body, used, stride=stride)
 
     def learn_colors(self, cam_from_body: Array, appearance: Appearance, rate: float) -> None:
         """Blend the colours along the outline at a pose (4,4) into an appearance."""

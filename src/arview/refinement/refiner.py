@@ -17,7 +17,7 @@ from arview.camera import Camera
 from arview.geometry import Array
 from arview.refinement.edge_spread import edge_spread
 from arview.refinement.evidence import EdgeSteps, PoseEvidence
-from arview.refinement.kernels import ModalityWeights, count_colors, run_edge_steps, run_evidence, run_stages
+from arview.refinement.kernels import STEP_SHARE, ModalityWeights, count_colors, run_edge_steps, run_evidence, run_stages
 from arview.refinement.modalities.region import BINS, EDGE_FUNCTION, ColorModel, log_odds, value_bins
 from arview.refinement.modalities.shading import ShadingOptions, crop_for_shading, refine_by_shading
 from arview.refinement.modalities.texture import TextureMatches
@@ -53,8 +53,6 @@ MIN_HISTOGRAM_COUNT = 50
 """Pixels needed on either side of the outline to learn colours."""
 SIZE_UNIT_PX = 80.0
 """Half diameter in the picture for which the stages are made; a larger part widens them."""
-STEP_SHARE = 0.01
-"""Length, in diameters, by which the projections of normals and tangents are measured."""
 
 
 @dataclass(frozen=True)
@@ -254,8 +252,12 @@ class PoseRefiner:
         cam_from_body: Array,
         appearance: Appearance,
         tolerance_px: float = 1.5,
+        stride: int = 1,
     ) -> PoseEvidence:
-        """Evidence of the picture for a pose (4,4); steps farther from an edge than the tolerance do not support it."""
+        """Evidence of the picture for a pose (4,4), of every n-th edge point.
+
+        Steps farther from an edge than the tolerance do not support it.
+        """
         terms = run_evidence(
             image,
             gray,
@@ -267,6 +269,7 @@ class PoseRefiner:
             self._step_mm,
             EDGE_THRESHOLD,
             tolerance_px,
+            stride,
         )
         return PoseEvidence(*terms)
 

@@ -96,7 +96,8 @@ SEARCH_STAGES = (
 )
 """Edges and colours, for a pose found by a search, which is off by some pixels."""
 LAST_STAGES = 2 * tuple(replace(stage, region_gain=0.05) for stage in TRACK_STAGES[2:])
-"""For a pose that is nearly right: coarse stages could lead it away, to an edge beside the outline."""
+"""For a pose that is nearly right: coarse stages could lead it away, to an edge beside the outline. The second round is
+for poses that have not settled after the first, see `SETTLED_PX`."""
 
 
 def _color_led(gain: float) -> tuple[Stage, ...]:
