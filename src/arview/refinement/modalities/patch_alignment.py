@@ -198,8 +198,10 @@ def common_shift(
     warps: NDArray[np.float64],
     chosen: NDArray[np.int64],
     reach: int,
-) -> tuple[float, float]:
+) -> tuple[float, float, float]:
     """Shift (du, dv), px of the finest level, that aligns the chosen patches best with a coarse image.
+
+    The third value is the mean squared correlation there; 0 where the best shift is at the border of the search.
 
     The search is exhaustive over ±``reach`` px of the coarse level and refined by parabolas. A shift is scored by the
     sum of squared positive correlations, so that patches on another surface count little.
@@ -253,6 +255,8 @@ def common_shift(
             if score[sv, su] > score[bv, bu]:
                 bv, bu = sv, su
     du, dv = float(bu - reach), float(bv - reach)
+    is_inside = 0 < bu < span - 1 and 0 < bv < span - 1
+    quality = score[bv, bu] / max(len(chosen), 1) if is_inside else 0.0
     if 0 < bu < span - 1:
         bend = score[bv, bu - 1] - 2.0 * score[bv, bu] + score[bv, bu + 1]
         if bend < 0.0:
@@ -261,4 +265,4 @@ def common_shift(
         bend = score[bv - 1, bu] - 2.0 * score[bv, bu] + score[bv + 1, bu]
         if bend < 0.0:
             dv += 0.5 * (score[bv - 1, bu] - score[bv + 1, bu]) / bend
-    return du * scale, dv * scale
+    return du * scale, dv * scale, quality

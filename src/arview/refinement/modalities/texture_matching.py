@@ -57,6 +57,9 @@ NEIGHBOURS = 7
 """Nearest neighbours with which the displacement of a patch is compared."""
 PATCH_SIDE = 9
 """Side of the patches, px."""
+NEAR_SQUARED_NCC = 0.7
+"""Mean squared correlation on the coarsest level from which the patches are where they were predicted, to a pixel of
+it, so that they are neither searched for farther away nor aligned on level 2."""
 COARSE_NCC = 0.6
 """Smallest correlation of a patch on the coarse level from which a pose is estimated."""
 
@@ -328,8 +331,9 @@ def match_texture(
 ) -> PatchMatches:
     """Find the corners of a keyframe in a new frame, see `PatchMatches`.
 
-    All patches are first shifted together on the coarsest level, then aligned one by one on level 2. If these agree on
-    a pose, it replaces the prediction. Patches are then aligned on levels 1 and 0.
+    All patches are first shifted together on the coarsest level. Where they are not near the prediction, they are then
+    aligned one by one on level 2; if these agree on a pose, it replaces the prediction. Patches are then aligned on
+    levels 1 and 0.
 
     Args:
         key_pyramid, pyramid: image pyramids of keyframe and frame.
@@ -351,14 +355,18 @@ def match_texture(
     _predict(anchors, cam_from_body, intrinsics, width, height, expected, predicted, warps=warps)
     seen = np.flatnonzero(expected)
     pixels = predicted.copy()
+    is_near = False
     if settings.search_px > 0 and len(seen) > 0:
         chosen = seen[:: max(1, len(seen) // 24)]
-        shift = common_shift(
-            key_pyramid[top], pyramid[top], 1 << top, anchors.pixels, predicted, warps, chosen, reach=settings.search_px
-        )
-        for a in range(2):
-            pixels[:, a] += shift[a]
-    if top > 1:
+        coarse_key, image, scale = key_pyramid[top], pyramid[top], 1 << top
+        shift = common_shift(coarse_key, image, scale, anchors.pixels, predicted, warps, chosen, reach=1)
+        is_near = shift[2] > NEAR_SQUARED_NCC
+        if not is_near:
+            reach = settings.search_px
+            shift = common_shift(coarse_key, image, scale, anchors.pixels, predicted, warps, chosen, reach=reach)
+        pixels[:, 0] += shift[0]
+        pixels[:, 1] += shift[1]
+    if top > 1 and not is_near:
         _align_level(2, key_pyramid, pyramid, anchors.pixels, warps, expected, COARSE_NCC, pixels=pixels, scores=scores)
         found = np.count_nonzero(scores)
         coarse = align_pose(points, cam_from_body, intrinsics, pixels, scores, damping, 1.0)
