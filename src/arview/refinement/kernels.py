@@ -127,13 +127,13 @@ def run_stages(
         edge_weight = weights.edge * stride
         spread_px = stages.edge_spread_px[s]
         view = _project_view(part, pose, intrinsics, step_mm, stride)
-        region = _measure_contour(image, colors, view, intrinsics[0], stages.region_scale[s], region_weight > 0)
+        region = _measure_contour(image, colors, view, intrinsics, stages.region_scale[s], region_weight > 0)
         profiles = _measure_profiles(
             gray, view, stages.edge_reach[s], stages.edge_step_px[s], weights.edge_threshold, intrinsics[10],
             is_used=edge_weight > 0,
         )  # fmt: skip
         if edge_weight > 0 and weights.region > 0:
-            weigh_by_color(image, colors, view.edge_lines, view.edge_kinds, profiles)
+            weigh_by_color(image, colors, view.edge_lines, view.edge_kinds, profiles, intrinsics[10])
         trust = 1.0
         for update in range(stages.updates[s]):
             hessian[:] = 0.0
@@ -198,11 +198,12 @@ def _project_view(
 
 @kernel
 def _measure_contour(
-    image: NDArray[np.uint8], colors: ColorModel, view: ViewLines, focal: float, scale: int, is_used: bool
-) -> RegionLines:
+    image: NDArray[np.uint8], colors: ColorModel, view: ViewLines, intrinsics: NDArray[np.float64], scale: int,
+    is_used: bool,
+) -> RegionLines:  # fmt: skip
     """`RegionLines` of the contour; empty without the region modality."""
     if is_used:
-        return measure_region(image, colors, view.contour_lines, view.contour_runs_mm, focal, scale)
+        return measure_region(image, colors, view.contour_lines, view.contour_runs_mm, intrinsics, scale)
     return RegionLines(np.zeros(0), np.zeros(0), np.zeros(0))
 
 
@@ -277,7 +278,7 @@ def run_evidence(
             part.contour_points[first:last], part.contour_normals[first:last], False, cam_from_body, intrinsics, step_mm
         )
         runs_mm = part.contour_runs_mm[first:last]
-        region = measure_region(image, colors, lines, runs_mm, intrinsics[0], EVIDENCE_SCALE)
+        region = measure_region(image, colors, lines, runs_mm, intrinsics, EVIDENCE_SCALE)
         terms = region_evidence(region, EVIDENCE_REGION_PX)
         region_support, region_information = terms.region_support, terms.region_information
     return EvidenceTerms(
@@ -342,7 +343,7 @@ def count_colors(
         part.contour_points[first:last], part.contour_normals[first:last], False, cam_from_body, intrinsics, step_mm
     )
     runs_mm = part.contour_runs_mm[first:last]
-    add_histograms(image, bin_of, lines, runs_mm, intrinsics[0], fore, back, HISTOGRAM_REACH_PX, HISTOGRAM_GAP_PX)
+    add_histograms(image, bin_of, lines, runs_mm, intrinsics, fore, back, HISTOGRAM_REACH_PX, HISTOGRAM_GAP_PX)
 
 
 @kernel

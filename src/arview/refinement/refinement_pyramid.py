@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,6 +21,7 @@ from arview.refinement.working_picture import (
     REACH,
     WorkingPicture,
     WorkingScaleOptions,
+    gray_of,
     matches_in,
     window_around,
     working_picture,
@@ -58,6 +59,11 @@ class RefinementPyramid:
         self._poses = list(poses)
         self._levels: dict[int, PictureRefiner] = {}
 
+    @cached_property
+    def gray(self) -> NDArray[np.uint8]:
+        """Grey levels (H,W) of the frame."""
+        return gray_of(self._image)
+
     @property
     def working(self) -> PictureRefiner:
         """The working picture, in which a pose is worth the same in every frame."""
@@ -84,7 +90,7 @@ class RefinementPyramid:
             refiner, scale = self._refiner, self.scales[number]
             window = window_around(refiner.camera, self._poses, refiner.diameter_mm, MARGIN_PX / min(scale, 1.0), REACH)
             has_colors = number == 0 or not refiner.options.use_edge
-            picture = working_picture(self._image, refiner.camera, scale, window, has_colors)
+            picture = working_picture(self._image, refiner.camera, scale, window, has_colors, self.gray)
             self._levels[number] = PictureRefiner(refiner, picture)
         return self._levels[number]
 
@@ -182,8 +188,8 @@ class PictureRefiner:
 
     def refine_shading(self, cam_from_body: Array, information: Array) -> tuple[Array, Array]:
         """Pose (4,4) and information (6,6), as `PoseRefiner.refine_shading`."""
-        gray = np.asarray(cv2.cvtColor(self.picture.image, cv2.COLOR_RGB2GRAY))
-        return self.refiner.refine_shading(gray, cam_from_body, information)
+        stored = self.picture.camera.magnified(self.picture.pitch)
+        return self.refiner.with_camera(stored).refine_shading(gray_of(self.picture.image), cam_from_body, information)
 
     def evidence(self, cam_from_body: Array, appearance: Appearance, stride: int = 1) -> PoseEvidence:
         """Evidence of the picture for a pose (4,4), of every n-th edge point."""

@@ -17,7 +17,14 @@ from arview.camera import Camera
 from arview.geometry import Array
 from arview.refinement.edge_spread import edge_spread
 from arview.refinement.evidence import EdgeSteps, PoseEvidence
-from arview.refinement.kernels import STEP_SHARE, ModalityWeights, count_colors, run_edge_steps, run_evidence, run_stages
+from arview.refinement.kernels import (
+    STEP_SHARE,
+    ModalityWeights,
+    count_colors,
+    run_edge_steps,
+    run_evidence,
+    run_stages,
+)
 from arview.refinement.modalities.region import BINS, EDGE_FUNCTION, ColorModel, log_odds, value_bins
 from arview.refinement.modalities.shading import ShadingOptions, crop_for_shading, refine_by_shading
 from arview.refinement.modalities.texture import TextureMatches

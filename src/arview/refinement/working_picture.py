@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arview.camera import Camera
+from arview.core.kernel import kernel
 from arview.geometry import Array
 from arview.refinement.modalities.edge import smoothed
 from arview.refinement.modalities.texture import TextureMatches
@@ -83,14 +84,34 @@ class WorkingScaleOptions:
 DEFAULT = WorkingScaleOptions()
 
 
+def gray_of(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Grey levels (H,W) uint8 of a picture (H,W,3) uint8 RGB, by the weights of ITU-R BT.601."""
+    if not image.flags.c_contiguous:
+        return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
+    gray = np.empty(image.shape[:2], dtype=np.uint8)
+    _fill_gray(image.reshape(-1), gray.reshape(-1))
+    return gray
+
+
+@kernel
+def _fill_gray(rgb: NDArray[np.uint8], gray: NDArray[np.uint8]) -> None:
+    """Fill grey levels (N,) of colours (3N,); OpenCV takes more processor time for it, in several threads."""
+    for i in range(gray.shape[0]):
+        red, green, blue = np.uint32(rgb[3 * i]), np.uint32(rgb[3 * i + 1]), np.uint32(rgb[3 * i + 2])
+        total = red * np.uint32(4899) + green * np.uint32(9617) + blue * np.uint32(1868) + np.uint32(8192)
+        gray[i] = np.uint8(total >> np.uint32(14))
+
+
 class WorkingPicture(NamedTuple):
-    """A window of a picture at a scale.
+    """A window of a picture at a scale, of which only what is measured is interpolated.
+
+    Colours and grey levels are those of the window reduced by a power of two, to less than twice its scale.
 
     Attributes:
         image: (h,w,3) uint8 RGB; empty in a picture made for edges only.
-        smooth: grey levels (h,w) uint8, smoothed for the edge modality; of an enlarged picture without colours they are
-            those of the window as it is.
-        camera: intrinsics of the window at this scale.
+        smooth: (h,w) uint8 grey levels, smoothed for the edge modality.
+        camera: intrinsics of the window at its scale.
+        pitch: size of the camera's pixels in pixels of ``image`` and ``smooth``.
         scale: of the window, relative to the picture.
         left, top, right, bottom: borders of the window in the picture, px.
     """
@@ -98,6 +119,7 @@ class WorkingPicture(NamedTuple):
     image: NDArray[np.uint8]
     smooth: NDArray[np.uint8]
     camera: Camera
+    pitch: float
     scale: float
     left: int
     top: int
@@ -108,11 +130,6 @@ class WorkingPicture(NamedTuple):
     def has_colors(self) -> bool:
         """Whether colours can be measured in it."""
         return self.image.shape[0] > 0
-
-    @property
-    def pitch(self) -> float:
-        """Size of the camera's pixels in pixels of ``smooth``."""
-        return 1.0 if self.has_colors else 1.0 / max(self.scale, 1.0)
 
     def covers(self, center: Array, reach_px: float, camera: Camera) -> bool:
         """Whether the window holds all that a picture of ``camera`` shows around a pixel (2,) within a reach."""
@@ -131,6 +148,7 @@ def working_picture(
     scale: float,
     window: tuple[float, float, float, float] | None = None,
     has_colors: bool = True,
+    gray: NDArray[np.uint8] | None = None,
 ) -> WorkingPicture:
     """A window of a picture at a scale.
 
@@ -141,6 +159,7 @@ def working_picture(
         window: left, upper, right and lower border, px; parts outside the picture are left out. None, or a window with
             too little of the picture: the whole picture.
         has_colors: make the colours, too; the grey picture alone takes less time.
+        gray: (H,W) uint8, `gray_of` of the picture, if it is known.
     """
     height, width = image.shape[:2]
     # Windows whose sides are multiples of the halvings are reduced by exactly two at each of them.
@@ -159,26 +178,21 @@ def working_picture(
         if min(last[0] - first[0], last[1] - first[1]) >= max(16, 16 / scale):
             (left, top), (right, bottom) = first, last
     right, bottom = left + (right - left) // unit * unit, top + (bottom - top) // unit * unit
-    small = image[top:bottom, left:right]
-    if not has_colors:
-        small = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
+    size = ((right - left) // unit, (bottom - top) // unit)
+    own = camera.cropped(left, top, right - left, bottom - top).scaled(*size)
+    window_gray = gray_of(image[top:bottom, left:right]) if gray is None else gray[top:bottom, left:right]
     for _ in range(halvings):
-        small = cv2.resize(small, (small.shape[1] // 2, small.shape[0] // 2), interpolation=cv2.INTER_AREA)
-    rest = scale * unit
-    is_enlarged = scale > 1.0 and not has_colors
-    if abs(rest - 1.0) > 1e-6 and not is_enlarged:
-        size = round(small.shape[1] * rest), round(small.shape[0] * rest)
-        small = cv2.resize(small, size, interpolation=cv2.INTER_LINEAR)
-    gray = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY) if has_colors else small
-    colors = small if has_colors else np.zeros((0, 0, 3), dtype=np.uint8)
-    is_whole = (left, top, right, bottom) == (0, 0, width, height)
-    own = camera if is_whole else camera.cropped(left, top, right - left, bottom - top)
-    if is_enlarged:
-        own = own.magnified(scale)
-    elif scale != 1.0:
-        own = own.scaled(gray.shape[1], gray.shape[0])
-    smooth = smoothed(np.asarray(gray), scale if is_enlarged else 1.0)
-    return WorkingPicture(np.asarray(colors), smooth, own, scale=scale, left=left, top=top, right=right, bottom=bottom)
+        half = (window_gray.shape[1] // 2, window_gray.shape[0] // 2)
+        window_gray = cv2.resize(window_gray, half, interpolation=cv2.INTER_AREA)
+    colors = np.zeros((0, 0, 3), dtype=np.uint8)
+    if has_colors:
+        colors = image[top:bottom, left:right]
+        # Four pixels of each square: histograms of colours need no more.
+        colors = np.asarray(cv2.resize(colors, size)) if halvings else np.ascontiguousarray(colors)
+    pitch = 1.0 / (scale * unit)
+    return WorkingPicture(
+        colors, smoothed(window_gray, 1.0 / pitch), own.magnified(1.0 / pitch), pitch, scale, left, top, right, bottom
+    )
 
 
 def matches_in(picture: WorkingPicture, matches: TextureMatches) -> TextureMatches:

@@ -379,7 +379,7 @@ class Tracker:
         predicted = apply_twist(state.cam_from_body, state.velocity)
         frame = FrameContext(image, self._levels(image, [state.cam_from_body, predicted]), predicted, predicted)
         if self._texture is not None:
-            frame.pyramid = self._texture.pyramid(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
+            frame.pyramid = self._texture.pyramid(frame.levels.gray)
             matches = self._texture.measure(frame.pyramid, predicted)
             frame.found_share = len(matches.weights) / max(matches.tried, 1)
             if len(matches.weights) >= MIN_MATCHES and frame.found_share >= MIN_MATCH_SHARE:

@@ -55,7 +55,7 @@ def polish(
         return cam_from_body
     window = window_around(camera, [cam_from_body], refiner.diameter_mm, MARGIN_PX / fine_scale)
     fine = working_picture(image, camera, fine_scale, window)
-    polished = refiner.with_camera(fine.camera).refine_fresh(fine.image, fine.smooth, cam_from_body, STAGES)
+    polished = refiner.with_camera(fine.camera, fine.pitch).refine_fresh(fine.image, fine.smooth, cam_from_body, STAGES)
     appearance = coarse.appearance_at(measured.image, cam_from_body)
     before, after = (
         coarse.evidence(measured.image, measured.gray, pose, appearance, TOLERANCE_PX).score

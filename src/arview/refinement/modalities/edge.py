@@ -7,7 +7,6 @@ hypotheses. At every update of the pose each point uses the hypothesis with the 
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import cv2
@@ -28,6 +27,8 @@ COLOR_REACH_PX = 4
 """Pixels to either side of a step whose colours are compared."""
 COLOR_GAIN = 4.0
 """Logarithm by which a step with the same colours on both sides is weaker where another one separates them fully."""
+SMOOTHED_SIGMA_PX = 0.82
+"""Standard deviation of the average over three pixels in a row."""
 LEVEL_UNIT = 1 << 14
 """Units of a profile in one grey level."""
 HYPOTHESES = 5
@@ -51,13 +52,13 @@ class EdgeProfiles(NamedTuple):
 
 
 def smoothed(gray: NDArray[np.uint8], scale: float = 1.0) -> NDArray[np.uint8]:
-    """Grey picture (H,W), averaged over 3×3 pixels of a picture larger by a scale, the input of the edge modality."""
+    """Grey picture (H,W), averaged over 3×3 pixels of a picture larger by a scale, the input of the edge modality.
+
+    From twice the size on interpolation smooths enough.
+    """
     if scale <= 1.0:
         return np.asarray(cv2.blur(gray, (3, 3)))
-    # Three pixels in a row with the variance of the average of three smaller ones.
-    outer = 1.0 / (3.0 * scale * scale)
-    sigma_px = math.sqrt(-0.5 / math.log(outer / (1.0 - 2.0 * outer)))
-    return np.asarray(cv2.GaussianBlur(gray, (3, 3), sigma_px))
+    return np.ascontiguousarray(gray if scale >= 2.0 else cv2.GaussianBlur(gray, (3, 3), SMOOTHED_SIGMA_PX / scale))
 
 
 @kernel
@@ -153,6 +154,7 @@ def weigh_by_color(
     lines: ProjectedLines,
     kinds: NDArray[np.uint8],
     profiles: EdgeProfiles,
+    pitch: float,
 ) -> None:
     """Weaken steps of the outline that do not separate colours of the part from colours of the background, in place.
 
@@ -167,6 +169,7 @@ def weigh_by_color(
         lines: `ProjectedLines` of the points; normals of outline points point outwards.
         kinds: (N,) EDGE_* bits of the points.
         profiles: `EdgeProfiles` of the points, whose strengths are changed.
+        pitch: of the points' pixels, see `intrinsics_of`.
     """
     bin_of, odds = colors.bin_of, colors.odds
     height, width = image.shape[0], image.shape[1]
@@ -175,8 +178,8 @@ def weigh_by_color(
     for i in range(kinds.shape[0]):
         if (kinds[i] & (EDGE_CONTOUR | EDGE_SHARP)) != EDGE_CONTOUR:
             continue
-        u, v = lines.pixels[i, 0], lines.pixels[i, 1]
-        nu, nv = lines.normals[i, 0], lines.normals[i, 1]
+        u, v = (lines.pixels[i, 0] + 0.5) * pitch, (lines.pixels[i, 1] + 0.5) * pitch
+        nu, nv = lines.normals[i, 0] * pitch, lines.normals[i, 1] * pitch
         best = 0.0
         for j in range(HYPOTHESES):
             if strengths[i, j] == 0.0:
@@ -186,8 +189,8 @@ def weigh_by_color(
                 if k == 0:
                     continue
                 t = positions[i, j] + k
-                x = min(max(int(u + t * nu + 0.5), 0), width - 1)
-                y = min(max(int(v + t * nv + 0.5), 0), height - 1)
+                x = min(max(int(u + t * nu), 0), width - 1)
+                y = min(max(int(v + t * nv), 0), height - 1)
                 lean = odds[bin_of[image[y, x, 0]] * 256 + bin_of[image[y, x, 1]] * 16 + bin_of[image[y, x, 2]]]
                 lean /= np.sqrt(1.0 + lean * lean)
                 total += lean if k < 0 else -lean

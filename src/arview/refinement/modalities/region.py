@@ -78,7 +78,7 @@ def add_histograms(
     bin_of: NDArray[np.int64],
     lines: ProjectedLines,
     runs_mm: NDArray[np.float32],
-    focal: float,
+    intrinsics: NDArray[np.float64],
     fore: NDArray[np.float64],
     back: NDArray[np.float64],
     reach_px: float,
@@ -91,24 +91,26 @@ def add_histograms(
         bin_of: (256,) histogram bin of a channel value.
         lines: `ProjectedLines` of the contour.
         runs_mm: (N,2) how far the picture stays part and background along each line.
-        focal: focal length, px.
+        intrinsics: as of `intrinsics_of`.
         reach_px: pixels counted to either side.
         gap_px: pixels beside the contour that are left out.
     """
     pixels, normals, depths = lines.pixels, lines.normals, lines.depths
     height, width = image.shape[0], image.shape[1]
+    pitch = intrinsics[10]
     for i in range(pixels.shape[0]):
         z = depths[i]
         if z <= 0:
             continue
+        u, v = (pixels[i, 0] + 0.5) * pitch, (pixels[i, 1] + 0.5) * pitch
         for side in range(2):
-            run = runs_mm[i, side] * focal / z
+            run = runs_mm[i, side] * intrinsics[0] / z
             reach = min(reach_px, run - gap_px)
-            sign = -1.0 if side == 0 else 1.0
+            sign = -pitch if side == 0 else pitch
             step = gap_px
             while step <= reach:
-                x = int(np.round(pixels[i, 0] + sign * step * normals[i, 0]))
-                y = int(np.round(pixels[i, 1] + sign * step * normals[i, 1]))
+                x = int(np.floor(u + sign * step * normals[i, 0]))
+                y = int(np.floor(v + sign * step * normals[i, 1]))
                 if 0 <= x < width and 0 <= y < height:
                     index = bin_of[image[y, x, 0]] * 256 + bin_of[image[y, x, 1]] * 16 + bin_of[image[y, x, 2]]
                     if side == 0:
@@ -136,7 +138,7 @@ def measure_region(
     colors: ColorModel,
     lines: ProjectedLines,
     runs_mm: NDArray[np.float32],
-    focal: float,
+    intrinsics: NDArray[np.float64],
     scale: int,
 ) -> RegionLines:
     """Displacement of the contour along each line, see `RegionLines`.
@@ -146,7 +148,7 @@ def measure_region(
         colors: `ColorModel`.
         lines: `ProjectedLines` of the contour.
         runs_mm: (N,2) how far the picture stays part and background along each line.
-        focal: focal length, px.
+        intrinsics: as of `intrinsics_of`.
         scale: pixels per segment.
     """
     bin_of, odds, edge_function = colors.bin_of, colors.odds, colors.edge_function
@@ -156,6 +158,7 @@ def measure_region(
     mean, information, crossing = np.zeros(count), np.zeros(count), np.full(count, -1.0)
     posterior = np.empty(12)
     flat = 1.0 / 12.0
+    focal, pitch = intrinsics[0], intrinsics[10]
     half = 0.5 * 19 * scale
     # Long segments are sampled, because neighbouring pixels are similar.
     sample_step = max(1, scale // 3)
@@ -169,8 +172,8 @@ def measure_region(
         # The line must stay on either side as far as the edge function varies.
         if run_in < 2.5 * scale or run_out < 2.5 * scale:
             continue
-        u, v = pixels[i, 0], pixels[i, 1]
-        nu, nv = normals[i, 0], normals[i, 1]
+        u, v = (pixels[i, 0] + 0.5) * pitch - 0.5, (pixels[i, 1] + 0.5) * pitch - 0.5
+        nu, nv = normals[i, 0] * pitch, normals[i, 1] * pitch
         if (
             min(u - half * abs(nu), v - half * abs(nv)) < 0.5
             or u + half * abs(nu) > width - 1.5
