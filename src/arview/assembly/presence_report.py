@@ -22,6 +22,8 @@ DISPLACED_LOG_ODDS = 2.4
 """A mismatched component is displaced if its alternative placement has more."""
 INSIDE_SHARE = 0.5
 """Share of the corners of a component's box that must be in the picture."""
+VISIBILITY_EVERY = 4
+"""Frames from one look at which components are visible to the next, unless they were observed meanwhile."""
 
 
 class PresenceReport:
@@ -47,6 +49,8 @@ class PresenceReport:
     def forget(self) -> None:
         """Another state follows: nothing that was reported holds any longer."""
         self._last: tuple[tuple[int, bool, bool, bytes], Mapping[str, ComponentPresence]] | None = None
+        self._visibility: tuple[int, NDArray[np.int8]] | None = None
+        self._frames = 0
 
     def presence(
         self, state: MonitorState, cam_from_model: Array, is_ambiguous: bool, may_be_missing: bool
@@ -59,7 +63,14 @@ class PresenceReport:
             is_ambiguous: other poses fit as well, in which components other than the base would be elsewhere.
             may_be_missing: whether the pose is known well enough to call a component missing.
         """
-        visibilities = self._visibilities(state, cam_from_model)
+        self._frames += 1
+        if (
+            self._visibility is None
+            or self._visibility[0] != state.observations
+            or self._frames % VISIBILITY_EVERY == 0
+        ):
+            self._visibility = state.observations, self._visibilities(state, cam_from_model)
+        visibilities = self._visibility[1]
         key = (state.observations, is_ambiguous, may_be_missing, visibilities.tobytes())
         if self._last is None or self._last[0] != key:
             found = self._presence_now(state, visibilities, is_ambiguous, may_be_missing)

@@ -16,8 +16,7 @@ from arview.core.kernel import kernel
 
 @kernel(inline=True)
 def add_line(
-    hessian: Any,
-    gradient: Any,
+    system: Any,
     point: Any,
     cam_from_body: Any,
     x: Any,
@@ -29,16 +28,17 @@ def add_line(
     residual: Any,
     weight: Any,
 ) -> Any:
-    """Add weight · (Jᵀ J, Jᵀ r) of one residual along (nu, nv) to the system; only the lower triangle is filled.
+    """Add weight · Jᵀ (J, r) of one residual along (nu, nv) to a system, in whole rows that the compiler vectorises.
 
     Args:
-        hessian, gradient: (6,6) and (6,) of the system.
+        system: (6,8) Hessian, gradient and a column of zeros, see `add_system`.
         point: (3,) in the body frame; x, y, z is the same point in the camera's frame.
         residual: px.
     """
-    ax = nu * intrinsics[0] / z
-    ay = nv * intrinsics[1] / z
-    az = -(ax * x + ay * y) / z
+    inverse_z = 1.0 / z
+    ax = nu * intrinsics[0] * inverse_z
+    ay = nv * intrinsics[1] * inverse_z
+    az = -(ax * x + ay * y) * inverse_z
     r = cam_from_body
     bx = r[0, 0] * ax + r[1, 0] * ay + r[2, 0] * az
     by = r[0, 1] * ax + r[1, 1] * ay + r[2, 1] * az
@@ -46,12 +46,20 @@ def add_line(
     j0 = point[1] * bz - point[2] * by
     j1 = point[2] * bx - point[0] * bz
     j2 = point[0] * by - point[1] * bx
-    jac = (j0, j1, j2, bx, by, bz)
+    jac = (j0, j1, j2, bx, by, bz, residual, 0.0)
     for a in range(6):
         wa = weight * jac[a]
-        gradient[a] += wa * residual
+        for b in range(8):
+            system[a, b] += wa * jac[b]
+
+
+@kernel(inline=True)
+def add_system(hessian: Any, gradient: Any, system: Any) -> Any:
+    """Add a system (6,8) of `add_line` to a Hessian (6,6), of which only the lower triangle is filled, and gradient."""
+    for a in range(6):
+        gradient[a] += system[a, 6]
         for b in range(a + 1):
-            hessian[a, b] += wa * jac[b]
+            hessian[a, b] += system[a, b]
 
 
 @kernel

@@ -9,6 +9,8 @@ count as usual. Whether an innovation is unusual is then a chi-squared test of i
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from arview.core.kernel import kernel
@@ -137,24 +139,29 @@ class MotionModel:
         covariance = self.covariance if pose_covariance is None else self.covariance + pose_covariance
         return float(_squared_mahalanobis(difference, covariance))
 
-    def is_unusual(self, difference: Array, pose_covariance: Array) -> bool:
-        """Whether an innovation (6,) is neither usual in this stream nor explained by the covariance of the pose."""
+    def is_unusual(self, difference: Array, pose_covariance: Callable[[], Array]) -> bool:
+        """Whether an innovation (6,) is neither usual in this stream nor explained by the covariance of the pose.
+
+        Args:
+            difference: of `innovation`.
+            pose_covariance: gives that of the pose (6,6), of `normalised_covariance`; seldom needed.
+        """
         squared_length = difference @ difference
         if squared_length > MAX_USUAL_MOTION:
             return True
         if squared_length <= MIN_UNUSUAL_MOTION or self.squared_distance(difference) <= MIN_UNUSUAL:
             return False
-        return self.squared_distance(difference, pose_covariance) > MIN_UNUSUAL
+        return self.squared_distance(difference, pose_covariance()) > MIN_UNUSUAL
 
-    def learn(self, difference: Array, pose_covariance: Array, is_confirmed: bool = False) -> None:
+    def learn(self, difference: Array, is_unusual: bool, is_confirmed: bool = False) -> None:
         """Take the innovation of a frame in; one confirmed by other means counts in full, however unusual.
 
         Args:
             difference: (6,) of `innovation`.
-            pose_covariance: (6,6) of `normalised_covariance`, of the pose.
+            is_unusual: see there.
             is_confirmed: whether the pose was confirmed or found by a recheck.
         """
-        self._unrest = UNREST_DECAY * self._unrest + self.is_unusual(difference, pose_covariance)
+        self._unrest = UNREST_DECAY * self._unrest + is_unusual
         weight = 1.0
         if not is_confirmed:
             weight = ROBUST_GAIN * min(1.0, MAX_SQUARED / max(self.squared_distance(difference), 1e-9))

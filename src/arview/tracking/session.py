@@ -205,7 +205,8 @@ class TrackingSession:
         for number in examined:
             others, covers = self._others(number), self._covers(number)
             pose = self.specimens[number].process(image, index, time_s, others, covers, prior)
-            self._poses[number] = replace(pose, instance=self._parts[number].name)
+            name = self._parts[number].name
+            self._poses[number] = replace(pose, instance=name) if name else pose
         for number in set(range(len(self.specimens))).difference(examined):
             self._poses[number] = self._waiting(number, index, time_s)
         self._separate()

@@ -50,8 +50,10 @@ MIN_MATCH_SHARE = 0.4
 TEXTURE_SCORE = 0.5
 """Score that texture adds to the quality when all of it is found, because it supports the pose where a hand hides the
 outline."""
-LEARNING_RATE = 0.2
-"""Share by which the colour histograms follow each frame."""
+LEARNING_EVERY = 2
+"""Frames from one look at colours and blur of the edges to the next."""
+LEARNING_RATE = 0.36
+"""Share by which the colour histograms follow each look."""
 MIN_LEARNING_QUALITY = 0.4
 """Quality below which colours are not learned, and the part is searched for around the predicted pose."""
 MIN_EDGE_SUPPORT, NEW_EDGE_SUPPORT = 0.65, 0.7
@@ -98,8 +100,8 @@ EXPOSURE_DECAY = 0.9
 """Exponent by which the estimated exposure fades, because the histograms follow slow changes."""
 EXPOSURE_LIMITS = (0.2, 5.0)
 """Smallest and largest exposure relative to the first frame."""
-SPREAD_RATE = 0.3
-"""Share by which the estimated blur of the edges follows each frame."""
+SPREAD_RATE = 0.5
+"""Share by which the estimated blur of the edges follows each look."""
 VELOCITY_DECAY = 0.9
 """Share of the last frame's motion that is expected in the next frame."""
 
@@ -340,14 +342,17 @@ class Tracker:
 
     def _is_unusual(self, frame: FrameContext) -> bool:
         """Whether the best pose differs from the predicted one more than usual, and than its covariance explains."""
-        return self.state.motion.is_unusual(*self._innovation(frame))
+        return self.state.motion.is_unusual(self._innovation(frame), lambda: self._innovation_covariance(frame))
 
-    def _innovation(self, frame: FrameContext) -> tuple[Array, Array]:
-        """Difference (6,) of the best pose from the predicted one, and covariance (6,6) of the best pose."""
+    def _innovation(self, frame: FrameContext) -> Array:
+        """Normalised difference (6,) of the best pose from the predicted one."""
+        return innovation(frame.found.cam_from_body, frame.predicted, self.diameter_mm)
+
+    def _innovation_covariance(self, frame: FrameContext) -> Array:
+        """Normalised covariance (6,6) of the best pose."""
         best = frame.found
         covariance = covariance_of(best.information, best.evidence.quality, self.diameter_mm, POINTS_BETWEEN_FRAMES)
-        difference = innovation(best.cam_from_body, frame.predicted, self.diameter_mm)
-        return difference, normalised_covariance(covariance, best.cam_from_body, self.diameter_mm)
+        return normalised_covariance(covariance, best.cam_from_body, self.diameter_mm)
 
     def _is_suspicious(self, frame: FrameContext) -> bool:
         """Whether the best pose may be wrong: its score is low, or lower than usual, or it is off the prediction."""
@@ -375,9 +380,9 @@ class Tracker:
     def _prepare(self, image: NDArray[np.uint8]) -> FrameContext:
         """A frame with its predicted pose and the texture found in it."""
         state = self.state
-        self._follow_exposure(image[..., 1])
         predicted = apply_twist(state.cam_from_body, state.velocity)
         frame = FrameContext(image, self._levels(image, [state.cam_from_body, predicted]), predicted, predicted)
+        self._follow_exposure(frame.levels.gray)
         if self._texture is not None:
             frame.pyramid = self._texture.pyramid(frame.levels.gray)
             matches = self._texture.measure(frame.pyramid, predicted)
@@ -398,7 +403,7 @@ class Tracker:
         pose, evidence = frame.found.cam_from_body, frame.found.evidence
         fine_score = frame.found.scores.fine_score
         if state.is_started:
-            state.motion.learn(*self._innovation(frame), frame.is_rechecked)
+            state.motion.learn(self._innovation(frame), self._is_unusual(frame), frame.is_rechecked)
             state.usual_score += SCORE_RATE * (evidence.score - state.usual_score)
             state.usual_fine_score += SCORE_RATE * (fine_score - state.usual_fine_score)
             state.velocity = VELOCITY_DECAY * relative_twist(state.cam_from_body, pose)
@@ -408,9 +413,12 @@ class Tracker:
         state.cam_from_body = pose
         state.edge_support += SUPPORT_RATE * (evidence.contour_support - state.edge_support)
         self._choose_modalities()
-        self._measure_spread(frame.levels, SPREAD_RATE)
+        state.frames += 1
+        is_due = state.frames % LEARNING_EVERY == 0
+        if is_due:
+            self._measure_spread(frame.levels, SPREAD_RATE)
         if quality > MIN_LEARNING_QUALITY:
-            if o.use_region:
+            if o.use_region and is_due:
                 frame.levels.finest_colors.learn_colors(pose, state.appearance, LEARNING_RATE)
             if self._texture is not None:
                 self._remember_texture(frame)
@@ -425,16 +433,16 @@ class Tracker:
         if self.refiner.part.is_smooth and self.options.use_edge and self.options.use_region:
             state.uses_edges = state.edge_support >= (MIN_EDGE_SUPPORT if state.uses_edges else NEW_EDGE_SUPPORT)
 
-    def _follow_exposure(self, channel: NDArray[np.uint8]) -> None:
+    def _follow_exposure(self, gray: NDArray[np.uint8]) -> None:
         """Compensate the colours for a change of exposure since the last frame.
 
-        The change is the median ratio of the brightness of a colour channel (H,W) on a coarse grid.
+        The change is the median ratio of the grey levels (H,W) on a coarse grid.
         """
         state = self.state
         step = EXPOSURE_GRID_PX
         if state.sparse_gray is None:
-            state.sparse_gray = np.zeros((channel.shape[0] // step, channel.shape[1] // step))
-        ratio = median_brightness_ratio(channel, state.sparse_gray, step)
+            state.sparse_gray = np.zeros((gray.shape[0] // step, gray.shape[1] // step))
+        ratio = median_brightness_ratio(gray, state.sparse_gray, step)
         if ratio != 1.0 or state.exposure != 1.0:
             low, high = EXPOSURE_LIMITS
             state.exposure = min(max(state.exposure**EXPOSURE_DECAY * ratio, low), high)

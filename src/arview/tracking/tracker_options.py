@@ -65,7 +65,7 @@ class TrackerOptions(RefinerOptions):
 
     use_texture: bool = True
     matcher: Matcher | None = None
-    shading: ShadingOptions = field(default_factory=lambda: ShadingOptions(gain=0.5, rounds=2))
+    shading: ShadingOptions = field(default_factory=lambda: ShadingOptions(gain=0.5, rounds=1))
 
     def __post_init__(self) -> None:
         if not (self.use_region or self.use_edge or self.use_texture):

@@ -28,6 +28,7 @@ class TrackerState:
         uses_edges: whether edges are used in the next frame, see `Tracker`.
         best_contour_support: best recent support of the outline.
         is_started: whether a frame has been tracked since the start.
+        frames: tracked since the start.
         spread_px: standard deviation of the blur of the part's edges, px of the frame; 0 where it is not known.
         motion: how far poses usually are from the predicted ones.
         unknown_twist: (6,) twist on the right of the pose, a turn about an axis of the part of which frames tell
@@ -45,6 +46,7 @@ class TrackerState:
     uses_edges: bool = True
     best_contour_support: float = 0.0
     is_started: bool = False
+    frames: int = 0
     spread_px: float = 0.0
     motion: MotionModel = field(default_factory=MotionModel)
     unknown_twist: Array | None = None

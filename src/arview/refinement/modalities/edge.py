@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from arview.core.kernel import kernel
 from arview.geometry import Array
-from arview.refinement.gauss_newton import add_line
+from arview.refinement.gauss_newton import add_line, add_system
 from arview.refinement.modalities.region import ColorModel
 from arview.refinement.projection import ProjectedLines, project
 from arview.rendering import EDGE_CONTOUR, EDGE_SHARP, EDGE_SILHOUETTE
@@ -202,7 +202,7 @@ def weigh_by_color(
             strengths[i, j] *= np.exp(COLOR_GAIN * (separation[j] - best))
 
 
-@kernel
+@kernel(fastmath=True)
 def add_edges(
     hessian: NDArray[np.float64],
     gradient: NDArray[np.float64],
@@ -235,6 +235,7 @@ def add_edges(
     pixels, normals = lines.pixels, lines.normals
     positions, strengths = profiles.positions, profiles.strengths
     cut = CUT_OFF * spread_px
+    system = np.zeros((6, 8))
     for i in range(points.shape[0]):
         best = 0.0
         residual = 0.0
@@ -267,4 +268,5 @@ def add_edges(
         w = weight * fade * fade * strength / (strength + strength_half) / (sigma_px * sigma_px)
         if (kinds[i] & (EDGE_CONTOUR | EDGE_SHARP)) == 0:
             w *= INNER_SILHOUETTE_WEIGHT if (kinds[i] & EDGE_SILHOUETTE) > 0 else FOLD_WEIGHT
-        add_line(hessian, gradient, p, r, x, y, z, normals[i, 0], normals[i, 1], intrinsics, residual, w)
+        add_line(system, p, r, x, y, z, normals[i, 0], normals[i, 1], intrinsics, residual, w)
+    add_system(hessian, gradient, system)

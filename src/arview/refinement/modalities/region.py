@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from arview.core.kernel import kernel
 from arview.geometry import Array
-from arview.refinement.gauss_newton import add_line
+from arview.refinement.gauss_newton import add_line, add_system
 from arview.refinement.projection import ProjectedLines, project
 
 BINS = 16
@@ -229,7 +229,7 @@ def _moments(posterior: NDArray[np.float64], norm: float) -> tuple[float, float]
     return mean, variance / norm + 1.0 / 12.0
 
 
-@kernel
+@kernel(fastmath=True)
 def add_region(
     hessian: NDArray[np.float64],
     gradient: NDArray[np.float64],
@@ -259,6 +259,7 @@ def add_region(
     r = cam_from_body
     pixels, normals = lines.pixels, lines.normals
     mean, information, crossing = region
+    system = np.zeros((6, 8))
     for i in range(points.shape[0]):
         if information[i] <= 0.0:
             continue
@@ -275,5 +276,6 @@ def add_region(
         w = weight * information[i] * trust
         squares += information[i] * trust * residual * residual
         count += trust
-        add_line(hessian, gradient, p, r, x, y, z, normals[i, 0], normals[i, 1], intrinsics, residual, w)
+        add_line(system, p, r, x, y, z, normals[i, 0], normals[i, 1], intrinsics, residual, w)
+    add_system(hessian, gradient, system)
     return squares, count

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from arview.core.kernel import kernel
 from arview.geometry import Array
-from arview.refinement.gauss_newton import add_line, apply_twist, solve_step
+from arview.refinement.gauss_newton import add_line, add_system, apply_twist, solve_step
 from arview.refinement.modalities.keyframes import Anchors, tangent_jacobian, to_camera
 from arview.refinement.modalities.patch_alignment import align_template, common_shift, prepare_template, sample_patch
 from arview.refinement.projection import project
@@ -107,7 +107,7 @@ def _agree_with_neighbours(
             weights[i] = 0.0
 
 
-@kernel
+@kernel(fastmath=True)
 def add_matches(
     hessian: NDArray[np.float64],
     gradient: NDArray[np.float64],
@@ -133,6 +133,7 @@ def add_matches(
         Sum of the weighted squared residuals, sum of the weights, and number of points within ``robust_px``.
     """
     r = cam_from_body
+    system = np.zeros((6, 8))
     sum_square = 0.0
     sum_weight = 0.0
     inliers = 0
@@ -149,11 +150,12 @@ def add_matches(
         if square >= 1.0:
             continue
         w = weights[i] * (1.0 - square) ** 2 / (sigma_px * sigma_px)
-        add_line(hessian, gradient, p, r, x, y, z, 1.0, 0.0, intrinsics, eu, w)
-        add_line(hessian, gradient, p, r, x, y, z, 0.0, 1.0, intrinsics, ev, w)
+        add_line(system, p, r, x, y, z, 1.0, 0.0, intrinsics, eu, w)
+        add_line(system, p, r, x, y, z, 0.0, 1.0, intrinsics, ev, w)
         sum_square += w * (eu * eu + ev * ev)
         sum_weight += w
         inliers += 1
+    add_system(hessian, gradient, system)
     return sum_square, sum_weight, inliers
 
 

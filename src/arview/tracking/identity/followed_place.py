@@ -32,6 +32,8 @@ specimens do not stand in one place."""
 MAX_UNKNOWN_FRAMES = 5
 """Frames without a sure pose up to which a pose near the last one is the same part although the motion of the
 background is not known."""
+KEPT_EVERY = 4
+"""Frames from one kept view to the next, because copies of large frames take time."""
 
 
 class Placement(Enum):
@@ -110,12 +112,14 @@ class FollowedPlace:
         if not is_sure:
             return
         self._own_motion.add(self.frame, estimate.cam_from_model)
+        self._kept_quality += QUALITY_RATE * (estimate.quality - self._kept_quality)
+        if self.kept is not None and not self._is_followed and self.frame % KEPT_EVERY:
+            return
         if self._buffer is None:
             self._buffer = np.empty_like(image)
         # Copied, because a source may use the memory of its frames again.
         np.copyto(self._buffer, image)
         self.kept = KeptView(self._buffer, estimate.cam_from_model, others)
-        self._kept_quality += QUALITY_RATE * (estimate.quality - self._kept_quality)
         self._is_followed = False
 
     def follow_background(self, image: NDArray[np.uint8], pose: Array | None) -> None:
