@@ -1,0 +1,57 @@
+"""The model-based tracker of ViSP: edges, and edges with KLT points."""
+
+from __future__ import annotations
+
+import subprocess
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+from peers.films import Film
+from peers.programs import SINGLE, MissingPeerError, Track, done, is_newer, needed, read_track
+
+SOURCE = Path(__file__).with_name("visp_track.cpp")
+LIBRARIES = ("visp_mbt", "visp_me", "visp_klt", "visp_vision", "visp_io", "visp_core", "opencv_core")
+GET = "get ViSP 3.5 or later: apt-get install g++ pkg-config libvisp-dev"
+MAX_POLYGONS = 5000
+"""Loading a model takes time with the square of its edges, and KLT has a mask for each polygon."""
+
+
+def visp_ways(build: Path, is_scan_line: bool) -> dict[str, Callable[[Film], Track]]:
+    """ViSP's ways by name, whose program is compiled into a folder; raises MissingPeerError.
+
+    Args:
+        build: folder for the program.
+        is_scan_line: hidden edges are found by drawing, not only by the normals of faces.
+    """
+    needed(("g++", "pkg-config"), GET)
+    found = subprocess.run(["pkg-config", "--cflags", "visp"], capture_output=True, text=True, check=False)
+    if found.returncode:
+        raise MissingPeerError(f"no ViSP on this machine; {GET}")
+    program = build / "visp_track"
+    if not is_newer(program, SOURCE):
+        build.mkdir(parents=True, exist_ok=True)
+        links = [f"-l{name}" for name in LIBRARIES]
+        done(
+            ["g++", "-O3", "-march=native", *found.stdout.split(), "-std=c++17", SOURCE, "-o", program, *links],
+            "compiling visp_track",
+        )
+    hidden = "scan-line" if is_scan_line else "normals"
+    return {
+        "ViSP edge": partial(_track, program, "edge", hidden),
+        "ViSP edge + KLT": partial(_track, program, "edge+klt", hidden),
+    }
+
+
+def _track(program: Path, mode: str, hidden: str, film: Film) -> Track:
+    output = film.folder / "visp.txt"
+    done([program, film.folder, mode, hidden, output], f"ViSP on {film.scene.name}", SINGLE)
+    return read_track(output, film.center_mm)
+
+
+def why_not(film: Film) -> str | None:
+    """Why ViSP is not run on a film, or None."""
+    count = len(film.polygons.loops)
+    if count > MAX_POLYGONS:
+        return f"its model has {count} polygons; ViSP's tracker is for parts of few flat faces (--visp-polygons)"
+    return None
