@@ -5,17 +5,16 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from arview.geometry import Array
 from arview.tracking import TrackedPart, TrackingSession
 from arview.video import Image
 from arview_lab.evaluation import PoseMeter, Scene, SceneFrame, scene_guide_views
-from peers.cao import Polygons, polygons_of, write_cao, write_smooth
 from peers.programs import Track
 
 WARM_UP = 5
@@ -34,8 +33,8 @@ class Film:
         scene: the sequence.
         frames: its frames that are used.
         images: (H,W,3) uint8 RGB of each.
-        folder: where the files for programs are: task.txt, frames/, body.obj, model.cao, smooth.txt, in metres, of the
-            model moved so that its centre is the origin.
+        folder: where the files for programs are: task.txt, frames/ and body.obj, in metres, of the model moved so that
+            its centre is the origin.
     """
 
     scene: Scene
@@ -55,11 +54,11 @@ class Film:
         """(3,) centre of the model's bounding box in its own frame, mm."""
         return self.scene.part.model.center_in_model
 
-    @cached_property
-    def polygons(self) -> Polygons:
-        """The mesh as polygons, m, about its centre."""
+    @property
+    def mesh_m(self) -> tuple[Array, NDArray[np.int32]]:
+        """Vertices (V,3) about the centre, m, and faces (F,3)."""
         vertices, faces, _ = self.scene.part.model.mesh
-        return polygons_of(1e-3 * (vertices - self.center_mm), faces)
+        return 1e-3 * (vertices - self.center_mm), faces
 
 
 def make_film(scene: Scene, folder: Path, limit: int | None = None) -> Film:
@@ -77,12 +76,10 @@ def make_film(scene: Scene, folder: Path, limit: int | None = None) -> Film:
     rows = np.column_stack([pose[:3, :3], at])
     lines = [" ".join(map(str, numbers)), *(" ".join(f"{v:.12g}" for v in row) for row in rows)]
     (folder / "task.txt").write_text("\n".join(lines) + "\n")
-    vertices, faces, _ = scene.part.model.mesh
-    body = [f"v {x:.9f} {y:.9f} {z:.9f}" for x, y, z in 1e-3 * (vertices - film.center_mm)]
+    vertices, faces = film.mesh_m
+    body = [f"v {x:.9f} {y:.9f} {z:.9f}" for x, y, z in vertices]
     body += [f"f {a} {b} {c}" for a, b, c in faces + 1]
     (folder / "body.obj").write_text("\n".join(body) + "\n")
-    write_cao(folder / "model.cao", film.polygons)
-    write_smooth(folder / "smooth.txt", film.polygons)
     return film
 
 

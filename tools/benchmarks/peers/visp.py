@@ -5,16 +5,20 @@ from __future__ import annotations
 import subprocess
 from collections.abc import Callable
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 
+import numpy as np
+
+from peers.cao import Polygons, polygons_of, write_cao, write_smooth
 from peers.films import Film
 from peers.programs import SINGLE, MissingPeerError, Track, done, is_newer, needed, read_track
 
 SOURCE = Path(__file__).with_name("visp_track.cpp")
 LIBRARIES = ("visp_mbt", "visp_me", "visp_klt", "visp_vision", "visp_io", "visp_core", "opencv_core")
 GET = "get ViSP 3.5 or later: apt-get install g++ pkg-config libvisp-dev"
-MAX_POLYGONS = 5000
-"""Loading a model takes time with the square of its edges, and KLT has a mask for each polygon."""
+MAX_POLYGONS = 1000
+"""ViSP's tracker is for parts of few flat faces: a model of more is simplified to this many triangles."""
 
 
 def visp_ways(build: Path, is_scan_line: bool) -> dict[str, Callable[[Film], Track]]:
@@ -44,14 +48,25 @@ def visp_ways(build: Path, is_scan_line: bool) -> dict[str, Callable[[Film], Tra
 
 
 def _track(program: Path, mode: str, hidden: str, film: Film) -> Track:
-    output = film.folder / "visp.txt"
+    output, model = film.folder / "visp.txt", film.folder / "model.cao"
+    if not model.is_file():
+        polygons = model_of(film)
+        write_smooth(film.folder / "smooth.txt", polygons)
+        write_cao(model, polygons)
     done([program, film.folder, mode, hidden, output], f"ViSP on {film.scene.name}", SINGLE)
     return read_track(output, film.center_mm)
 
 
-def why_not(film: Film) -> str | None:
-    """Why ViSP is not run on a film, or None."""
-    count = len(film.polygons.loops)
-    if count > MAX_POLYGONS:
-        return f"its model has {count} polygons; ViSP's tracker is for parts of few flat faces (--visp-polygons)"
-    return None
+def model_of(film: Film) -> Polygons:
+    """The part's polygons, m; a part of many is first simplified, since ViSP compares every edge with every other."""
+    vertices, faces = film.mesh_m
+    polygons = polygons_of(vertices, faces)
+    if len(polygons.loops) <= MAX_POLYGONS or find_spec("open3d") is None:
+        return polygons
+    import open3d
+
+    vector, indices = open3d.utility.Vector3dVector, open3d.utility.Vector3iVector
+    mesh = open3d.geometry.TriangleMesh(vector(vertices), indices(faces))
+    mesh.merge_close_vertices(1e-6)
+    small = mesh.simplify_quadric_decimation(MAX_POLYGONS)
+    return polygons_of(np.asarray(small.vertices), np.asarray(small.triangles, dtype=np.int32))

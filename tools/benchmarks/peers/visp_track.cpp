@@ -126,7 +126,7 @@ void setUp(vpMbGenericTracker &tracker, const Task &task, bool has_klt, bool is_
   vpMe edges;
   edges.setMaskSize(5);
   edges.setMaskNumber(180);
-  edges.setRange(8);
+  edges.setRange(10);
   edges.setMu1(0.5);
   edges.setMu2(0.5);
   edges.setSampleStep(4);
@@ -139,11 +139,11 @@ void setUp(vpMbGenericTracker &tracker, const Task &task, bool has_klt, bool is_
   tracker.setMovingEdge(edges);
   if (has_klt) {
     vpKltOpencv klt;
-    klt.setMaxFeatures(300);
+    klt.setMaxFeatures(10000);
     klt.setWindowSize(5);
     klt.setQuality(0.01);
-    klt.setMinDistance(8);
-    klt.setHarrisFreeParameter(0.01);
+    klt.setMinDistance(5);
+    klt.setHarrisFreeParameter(0.02);
     klt.setBlockSize(3);
     klt.setPyramidLevels(3);
     tracker.setKltOpencv(klt);

@@ -1,8 +1,8 @@
 // Follows a part through a film with the region modality of M3T and a colour camera:
 //
-//   m3t_track FOLDER default|rbot MODEL OUTPUT
+//   m3t_track FOLDER default|rbot MESH VIEWS OUTPUT
 //
-// FOLDER holds task.txt, frames/NNNNNN.png and body.obj; lengths are in metres. MODEL is M3T's own file of views, made
+// FOLDER holds task.txt and frames/NNNNNN.png; lengths are in metres. VIEWS is M3T's own file of views of the mesh, made
 // where it is missing, which takes OpenGL. Writes a line for each frame: CPU time in ms, and the 3x4 pose, row by row.
 // Reading pictures and making views are not in the time.
 
@@ -46,8 +46,8 @@ void useRbotSettings(m3t::RegionModality &region, m3t::Tracker &tracker) {
   tracker.set_n_corr_iterations(7);
 }
 
-int run(const std::filesystem::path &folder, bool is_rbot, const std::filesystem::path &views,
-        const std::string &output) {
+int run(const std::filesystem::path &folder, bool is_rbot, const std::filesystem::path &mesh,
+        const std::filesystem::path &views, const std::string &output) {
   std::ifstream task(folder / "task.txt");
   int count = 0;
   m3t::Intrinsics camera;
@@ -61,7 +61,7 @@ int run(const std::filesystem::path &folder, bool is_rbot, const std::filesystem
   pose.linear() = Eigen::Quaternionf(pose.linear()).normalized().toRotationMatrix();
 
   const m3t::Transform3fA same = m3t::Transform3fA::Identity();
-  auto body = std::make_shared<m3t::Body>("body", folder / "body.obj", 1.0f, true, false, same);
+  auto body = std::make_shared<m3t::Body>("body", mesh, 1.0f, true, false, same);
   if (!body->SetUp())
     return failed("the body");
   auto model = std::make_shared<m3t::RegionModel>("model", body, views);
@@ -101,10 +101,10 @@ int run(const std::filesystem::path &folder, bool is_rbot, const std::filesystem
 } // namespace
 
 int main(int count, char **words) {
-  if (count != 5) {
-    std::cerr << "m3t_track FOLDER default|rbot MODEL OUTPUT\n";
+  if (count != 6) {
+    std::cerr << "m3t_track FOLDER default|rbot MESH VIEWS OUTPUT\n";
     return 2;
   }
   cv::setNumThreads(1);
-  return run(words[1], std::string(words[2]) == "rbot", words[3], words[4]);
+  return run(words[1], std::string(words[2]) == "rbot", words[3], words[4], words[5]);
 }
