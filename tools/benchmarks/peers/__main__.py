@@ -10,6 +10,7 @@ import sys
 import tempfile
 from collections.abc import Callable
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +21,9 @@ sys.path[:0] = [str(ROOT / "tools" / "lab"), str(HERE.parent)]
 from options import positive
 from peers.clouds import CloudRow, cloud_rows
 from peers.colmap import PhotoRow, photo_rows
-from peers.films import Film, Track, TrackRow, in_turn, make_film, row_of, track_with_arview, warm_up
+from peers.films import Film, TrackRow, make_film, row_of, track_with_arview, warm_up
 from peers.m3t.ways import m3t_ways
-from peers.programs import MissingPeerError
+from peers.programs import MissingPeerError, Track
 from peers.visp import visp_ways
 from recordings import scenes, skip, table
 
@@ -41,11 +42,11 @@ A peer that is missing is left out, with a line that says how to get it."""
 
 EPILOG = """\
 peers:
-  visp     the model-based tracker of ViSP, edges and edges with KLT points (Debian: libvisp-dev), each sequence from its
-           first reference pose. A part of more than 1,000 flat faces is simplified to as many triangles, and the edges
-           of its smooth surfaces count where they are a silhouette; such parts are not what ViSP is made for
-  m3t      the region tracker M3T (github.com/DLR-RM/3DObjectTracking) with a colour camera, likewise, with its defaults
-           and with its authors' settings for RBOT; views of a new part take a minute, once, and do not count
+  visp     the model-based tracker of ViSP, edges and edges with KLT points (Debian: libvisp-dev), from the first
+           reference pose of each sequence. A part of more than 1,000 flat faces is simplified to as many triangles,
+           and the edges of its smooth surfaces count where they are a silhouette: ViSP is not made for such parts
+  m3t      the region tracker M3T (github.com/DLR-RM/3DObjectTracking) with a colour camera, likewise, with its
+           defaults and with its authors' settings for RBOT; views of a new part take a minute, once, and do not count
   colmap   structure from motion by pycolmap's defaults, exhaustive matching, incremental and global mapping, beside
            `arview.reconstruct` to the scale; neither knows the camera, and arview has the CAD part for the scale
   clouds   point-to-plane ICP of open3d and GICP of small_gicp (both from PyPI) beside the registration to the surface
@@ -53,8 +54,9 @@ peers:
 CPU time is user and system time of all threads. arview and the peers run in turn, A B A B, as often as --rounds says; a
 column gives medians over the rounds, and in brackets the lowest and the highest round. In films only the tracker is in
 the time, not the reading of pictures (for ViSP, not their conversion to grey either); the first frame does not count.
-Peers run with one OpenMP thread. Errors are those of the first round where there is a reference; "right" is within 5 cm
-and 5°. The references of cube and teabox are tracks by ViSP itself: they say how far apart the two are, not who is right.
+Peers run with one OpenMP thread. Errors are those of the first round where there is a reference; "right" is within
+5 cm and 5°. The references of cube and teabox are tracks by ViSP itself: they say how far apart the two are, not who is
+right.
 
 $ARVIEW_DATA is the folder that holds sequences/. What is compiled goes to out/peers.
 exit code: 0, or 1 when a peer that is here failed"""
@@ -98,8 +100,8 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument("--rounds", type=positive, default=3, metavar="N", help="default: 3")
     made.add_argument("--sequences", default=",".join(SEQUENCES), metavar="NAMES", help="default: %(default)s")
     made.add_argument("--frames", type=positive, metavar="N", help="of each sequence at most; default: all")
-    made.add_argument("--visp-scan-line", action="store_true",
-                      help="ViSP also with its scan-line test of hidden edges, which takes several times as long")  # fmt: skip
+    scan_line = "ViSP also with its scan-line test of hidden edges, which takes several times as long"
+    made.add_argument("--visp-scan-line", action="store_true", help=scan_line)
     made.add_argument("--m3t", type=Path, metavar="FOLDER", help="checkout of DLR-RM/3DObjectTracking")
     made.add_argument("--photos", type=Path, metavar="FOLDER", help="for colmap; default: made of the sample plate's")
     made.add_argument("--part", type=Path, metavar="PART", help="what is in the photos of --photos")
@@ -137,9 +139,7 @@ def tracking_ways(
     """The trackers that are here, by name."""
     ways: dict[str, Callable[[Film], Track]] = {}
     if "visp" in peers:
-        hidden = (False, True) if options.visp_scan_line else (False,)
-        for is_scan_line in hidden:
-            ways |= attempt("visp", lambda test=is_scan_line: visp_ways(BUILD / "visp", test), failures) or {}
+        ways |= attempt("visp", lambda: visp_ways(BUILD / "visp", options.visp_scan_line), failures) or {}
     if "m3t" in peers:
         ways |= attempt("m3t", lambda: m3t_ways(options.m3t, BUILD / "m3t"), failures) or {}
     return ways
@@ -148,15 +148,22 @@ def tracking_ways(
 def track_rows(
     ways: dict[str, Callable[[Film], Track]], options: argparse.Namespace, failures: list[str]
 ) -> list[TrackRow]:
-    """arview and the trackers on each sequence."""
+    """All trackers on each sequence, arview first, in turn; one that fails is left out from there on."""
     rows = []
     for name, scene in scenes(tuple(options.sequences.split(","))).items():
         with tempfile.TemporaryDirectory() as folder:
             film = make_film(scene, Path(folder) / "film", options.frames)
             warm_up(film)
-            all_ways = {"arview": track_with_arview, **ways}
-            tracks = attempt(name, lambda film=film, every=all_ways: in_turn(every, film, options.rounds), failures)
-            rows += [row_of(film, way, of_way) for way, of_way in (tracks or {}).items()]
+            tracks: dict[str, list[Track]] = {"arview": [], **{way: [] for way in ways}}
+            for _ in range(options.rounds):
+                for way in list(tracks):
+                    work = partial(ways.get(way, track_with_arview), film)
+                    track = attempt(f"{way} on {name}", work, failures)
+                    if track is None:
+                        del tracks[way]
+                    else:
+                        tracks[way].append(track)
+            rows += [row_of(film, way, of_way) for way, of_way in tracks.items()]
             print(f"{name}: done", file=sys.stderr, flush=True)
     return rows
 

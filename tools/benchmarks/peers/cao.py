@@ -1,4 +1,4 @@
-"""A CAD mesh as a model of polygons for ViSP (.cao), with a list of the edges between its polygons that are not sharp."""
+"""A CAD mesh as a model of polygons for ViSP (.cao), with a list of those edges that are not sharp."""
 
 from __future__ import annotations
 

@@ -5,8 +5,10 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib.util import find_spec
 
 import numpy as np
+from numpy.typing import NDArray
 
 from arview.cad import load_part
 from arview.geometry import Array, apply, exp_so3, invert, rigid, rotation_angle_rad
@@ -14,7 +16,7 @@ from arview.measurement.cloud.mesh_surface import MeshSurface
 from arview.measurement.cloud.registration import register_to_surface
 from arview_lab.studies.common import EXACT, post
 from peers.alone import alone, environment
-from suites.registration import of_open3d, of_small_gicp
+from recordings import skip
 from suites.scaling import PLATE
 
 REFERENCE, MEASURED = 240_000, 24_000
@@ -23,16 +25,22 @@ NOISE_MM = 0.05
 SHIFT_MM = (0.8, -0.6, 0.4)
 TURN_DEG = 0.5
 SEED_OF_REFERENCE = 100
-PEERS = ("open3d point to plane", "small_gicp GICP")
+REACH_MM = 5.0
+"""Largest distance of corresponding points, for all."""
+STRICT = (1e-12, 1e-9, 200)
+"""Relative changes of fitness and of RMS error at which ICP ends, and most iterations: as exact as it gets."""
+
+Way = Callable[[Array, Array, Array], Array]
+"""``target_from_source`` (4,4) of points (N,3), reference points (M,3) and their normals (M,3), mm."""
 
 
 @dataclass(frozen=True)
 class Surface:
-    """A surface to register to, its centre (3,), mm, and whether its points determine all rotations."""
+    """A surface to register to: vertices (V,3) and centre (3,), mm, faces (F,3), and whether it is one of revolution."""
 
     name: str
     vertices: Array
-    faces: Array
+    faces: NDArray[np.integer]
     center: Array
     is_round: bool
 
@@ -73,11 +81,11 @@ def cloud_rows(rounds: int) -> list[CloudRow]:
 
 
 def _rows(rounds: int) -> list[CloudRow]:
-    peers = {name: way for name, way in {**of_open3d(), **of_small_gicp()}.items() if name in PEERS}
+    peers = {**_of_open3d(), **_of_small_gicp()}
     return [row for surface in surfaces() for row in _on(surface, peers, rounds)]
 
 
-def _on(surface: Surface, peers: dict[str, Callable[[Array, Array, Array], Array]], rounds: int) -> list[CloudRow]:
+def _on(surface: Surface, peers: dict[str, Way], rounds: int) -> list[CloudRow]:
     known = MeshSurface(surface.vertices, surface.faces)
     move = rigid(exp_so3(np.radians(TURN_DEG) * np.array([0.6, 0.0, 0.8])), np.array(SHIFT_MM))
     move[:3, 3] += surface.center - move[:3, :3] @ surface.center  # turns about the centre
@@ -106,3 +114,46 @@ def _on(surface: Surface, peers: dict[str, Callable[[Array, Array, Array], Array
             if row.rotation_deg is not None:
                 row.rotation_deg.append(float(np.degrees(rotation_angle_rad(truth, found))))
     return list(rows.values())
+
+
+def _of_open3d() -> dict[str, Way]:
+    if find_spec("open3d") is None:
+        skip("open3d", "pip install open3d")
+        return {}
+    import open3d
+
+    ways, vector = open3d.pipelines.registration, open3d.utility.Vector3dVector
+
+    def by(criteria: object) -> Way:
+        def way(points: Array, reference: Array, normals: Array) -> Array:
+            source, target = (open3d.geometry.PointCloud(vector(each)) for each in (points, reference))
+            target.normals = vector(normals)
+            plane = ways.TransformationEstimationPointToPlane()
+            found = ways.registration_icp(source, target, REACH_MM, np.eye(4), plane, criteria)
+            return np.asarray(found.transformation)
+
+        return way
+
+    return {
+        "open3d point to plane, its defaults": by(ways.ICPConvergenceCriteria()),
+        "open3d point to plane, to the end": by(ways.ICPConvergenceCriteria(*STRICT)),
+    }
+
+
+def _of_small_gicp() -> dict[str, Way]:
+    if find_spec("small_gicp") is None:
+        skip("small_gicp", "pip install small_gicp")
+        return {}
+    import small_gicp
+
+    def by(kind: str) -> Way:
+        def way(points: Array, reference: Array, normals: Array) -> Array:
+            found = small_gicp.align(
+                reference, points, registration_type=kind, downsampling_resolution=0.01,
+                max_correspondence_distance=REACH_MM, num_threads=1,
+            )  # fmt: skip
+            return np.asarray(found.T_target_source)
+
+        return way
+
+    return {"small_gicp point to plane": by("PLANE_ICP"), "small_gicp GICP": by("GICP")}

@@ -50,7 +50,7 @@ class PhotoRun:
 
 @dataclass(frozen=True)
 class PhotoRow:
-    """One step, or one way from the photos to their places: CPU seconds of each round, and photos placed in the first."""
+    """One step, or one way from photos to their places: CPU seconds of each round, photos placed in the first."""
 
     way: str
     step: str

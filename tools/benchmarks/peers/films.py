@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -107,15 +107,6 @@ def _session(film: Film) -> TrackingSession:
     scene = film.scene
     part = TrackedPart(scene_guide_views(scene), scene.part.model, initial_cam_from_model=film.first_pose)
     return TrackingSession([part], scene.camera)
-
-
-def in_turn(ways: dict[str, Callable[[Film], Track]], film: Film, rounds: int) -> dict[str, list[Track]]:
-    """The tracks of each way through a film, run in turn: A, B, …, A, B, …"""
-    tracks: dict[str, list[Track]] = {name: [] for name in ways}
-    for _ in range(rounds):
-        for name, way in ways.items():
-            tracks[name].append(way(film))
-    return tracks
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Peers that are C++ libraries: a small program of ours is compiled where it is needed, and writes the poses it finds."""
+"""Peers that are C++ libraries: a small program is compiled where it is needed, and writes the poses it finds."""
 
 from __future__ import annotations
 

@@ -21,12 +21,12 @@ MAX_POLYGONS = 1000
 """ViSP's tracker is for parts of few flat faces: a model of more is simplified to this many triangles."""
 
 
-def visp_ways(build: Path, is_scan_line: bool) -> dict[str, Callable[[Film], Track]]:
+def visp_ways(build: Path, has_scan_line: bool) -> dict[str, Callable[[Film], Track]]:
     """ViSP's ways by name, whose program is compiled into a folder; raises MissingPeerError.
 
     Args:
         build: folder for the program.
-        is_scan_line: hidden edges are found by drawing, not only by the normals of faces.
+        has_scan_line: also the ways that find hidden edges by drawing, and not only by the normals of faces.
     """
     needed(("g++", "pkg-config"), GET)
     found = subprocess.run(["pkg-config", "--cflags", "visp"], capture_output=True, text=True, check=False)
@@ -40,11 +40,11 @@ def visp_ways(build: Path, is_scan_line: bool) -> dict[str, Callable[[Film], Tra
             ["g++", "-O3", "-march=native", *found.stdout.split(), "-std=c++17", SOURCE, "-o", program, *links],
             "compiling visp_track",
         )
-    hidden = "scan-line" if is_scan_line else "normals"
-    return {
-        "ViSP edge": partial(_track, program, "edge", hidden),
-        "ViSP edge + KLT": partial(_track, program, "edge+klt", hidden),
-    }
+    ways: dict[str, Callable[[Film], Track]] = {}
+    for hidden, suffix in (("normals", ""), ("scan-line", ", scan line"))[: 1 + has_scan_line]:
+        ways[f"ViSP edge{suffix}"] = partial(_track, program, "edge", hidden)
+        ways[f"ViSP edge + KLT{suffix}"] = partial(_track, program, "edge+klt", hidden)
+    return ways
 
 
 def _track(program: Path, mode: str, hidden: str, film: Film) -> Track:

@@ -38,7 +38,7 @@ def registrations() -> Iterator[tuple[str, float, float]]:
         return register_clouds(points, IcpTarget(reference, normals), options=options).target_from_source
 
     methods: dict[str, Callable[[Array, Array, Array], Array]] = {
-        "exact surface": exact, "point to plane": plane, "point to point": point, **of_open3d(), **of_small_gicp(),
+        "exact surface": exact, "point to plane": plane, "point to point": point, **_of_open3d(), **_of_small_gicp(),
     }  # fmt: skip
     for name, method in methods.items():
         seconds, errors = [], []
@@ -52,8 +52,7 @@ def registrations() -> Iterator[tuple[str, float, float]]:
         yield name, float(np.median(seconds)), float(np.mean(errors))
 
 
-def of_open3d() -> dict[str, Callable[[Array, Array, Array], Array]]:
-    """Ways of open3d by name, ``target_from_source`` of points, reference points and their normals; none without it."""
+def _of_open3d() -> dict[str, Callable[[Array, Array, Array], Array]]:
     if find_spec("open3d") is None:
         skip("open3d", "pip install open3d")
         return {}
@@ -81,8 +80,7 @@ def of_open3d() -> dict[str, Callable[[Array, Array, Array], Array]]:
     }
 
 
-def of_small_gicp() -> dict[str, Callable[[Array, Array, Array], Array]]:
-    """Ways of small_gicp by name, likewise."""
+def _of_small_gicp() -> dict[str, Callable[[Array, Array, Array], Array]]:
     if find_spec("small_gicp") is None:
         skip("small_gicp", "pip install small_gicp")
         return {}

@@ -44,6 +44,6 @@ def _track(program: Path, settings: str, film: Film) -> Track:
         shutil.copyfile(mesh, kept)
     output = film.folder / "m3t.txt"
     command = [program, film.folder, settings, kept, kept.with_suffix(".views"), output]
-    virtual = [] if "DISPLAY" in os.environ else ["xvfb-run", "-a"]
+    virtual: list[str | Path] = [] if "DISPLAY" in os.environ else ["xvfb-run", "-a"]
     done([*virtual, *command], f"M3T on {film.scene.name}", SINGLE)
     return read_track(output, film.center_mm)
