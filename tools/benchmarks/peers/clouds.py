@@ -36,7 +36,7 @@ Way = Callable[[Array, Array, Array], Array]
 
 @dataclass(frozen=True)
 class Surface:
-    """A surface to register to: vertices (V,3) and centre (3,), mm, faces (F,3), and whether it is one of revolution."""
+    """A surface to register to: vertices (V,3) and centre (3,), mm, faces (F,3); whether it is one of revolution."""
 
     name: str
     vertices: Array

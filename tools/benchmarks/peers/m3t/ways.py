@@ -5,12 +5,13 @@ from __future__ import annotations
 import hashlib
 import os
 import shutil
+import sys
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
 from peers.films import Film
-from peers.programs import SINGLE, MissingPeerError, Track, done, is_newer, needed, read_track
+from peers.programs import SINGLE, MissingPeerError, Track, done, needed, read_track
 
 HERE = Path(__file__).resolve().parent
 GET = "git clone https://github.com/DLR-RM/3DObjectTracking and give the folder with --m3t"
@@ -29,9 +30,10 @@ def m3t_ways(checkout: Path | None, build: Path) -> dict[str, Callable[[Film], T
         needed(("xvfb-run",), f"M3T draws its views with OpenGL; {PACKAGES}")
     program = build / "m3t_track"
     try:
-        if not is_newer(program, HERE / "m3t_track.cpp", HERE / "CMakeLists.txt"):
-            done(["cmake", "-S", HERE, "-B", build, f"-DM3T={source.resolve()}"], "cmake")
-        done(["cmake", "--build", build, "-j1"], "building M3T")
+        done(["cmake", "-S", HERE, "-B", build, f"-DM3T={source.resolve()}"], "cmake")
+        if not program.is_file():
+            print("M3T: building it, once; this takes some minutes", file=sys.stderr, flush=True)
+        done(["cmake", "--build", build, f"-j{os.cpu_count() or 1}"], "building M3T")
     except RuntimeError as error:
         raise MissingPeerError(f"{error}\n{PACKAGES}") from error
     return {"M3T": partial(_track, program, "default"), "M3T, RBOT settings": partial(_track, program, "rbot")}
@@ -43,7 +45,11 @@ def _track(program: Path, settings: str, film: Film) -> Track:
     if not kept.is_file():  # its views are tied to the path of the mesh
         shutil.copyfile(mesh, kept)
     output = film.folder / "m3t.txt"
-    command = [program, film.folder, settings, kept, kept.with_suffix(".views"), output]
+    views = kept.with_suffix(".views")
+    if not views.is_file():
+        print(
+            f"M3T: making its views of {film.scene.name}, once; this takes a minute or two", file=sys.stderr, flush=True
+        )
     virtual: list[str | Path] = [] if "DISPLAY" in os.environ else ["xvfb-run", "-a"]
-    done([*virtual, *command], f"M3T on {film.scene.name}", SINGLE)
+    done([*virtual, program, film.folder, settings, kept, views, output], f"M3T on {film.scene.name}", SINGLE)
     return read_track(output, film.center_mm)
