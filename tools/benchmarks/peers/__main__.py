@@ -54,9 +54,9 @@ peers:
 CPU time is user and system time of all threads. arview and the peers run in turn, A B A B, as often as --rounds says; a
 column gives medians over the rounds, and in brackets the lowest and the highest round. In films only the tracker is in
 the time, not the reading of pictures (for ViSP, not their conversion to grey either); the first frame does not count.
-Peers run with one OpenMP thread. Errors are those of the first round where there is a reference; "right" is within
-5 cm and 5°. The references of cube and teabox are tracks by ViSP itself: they say how far apart the two are, not who is
-right.
+Trackers and ICP run with one OpenMP thread. Errors are those of the first round where there is a reference; "right" is
+within 5 cm and 5°. The references of cube and teabox are tracks by ViSP itself: they say how far apart the two are,
+not who is right.
 
 $ARVIEW_DATA is the folder that holds sequences/. What is compiled goes to out/peers.
 exit code: 0, or 1 when a peer that is here failed"""

@@ -54,7 +54,7 @@ def polygons_of(vertices: Array, faces: NDArray[np.int32]) -> Polygons:
     for index, triangle in enumerate(triangles.tolist()):
         for edge in _edges(triangle):
             beside[_undirected(edge)].append(index)
-    pairs = np.array([around for around in beside.values() if len(around) == 2]).reshape(-1, 2)
+    pairs = np.array([around for around in beside.values() if len(around) == 2], dtype=np.int64).reshape(-1, 2)
     is_flat = np.sum(normals[pairs[:, 0]] * normals[pairs[:, 1]], axis=1) > np.cos(np.radians(FLAT_DEG))
     flat = pairs[is_flat]
     graph = coo_array((np.ones(len(flat)), (flat[:, 0], flat[:, 1])), shape=(len(triangles), len(triangles)))

@@ -65,7 +65,7 @@ class PhotoRow:
 
 
 def with_arview(photos: Path, part: Path | None) -> PhotoRun:
-    """Reconstruct with arview, up to the scale."""
+    """Reconstruct with arview, up to the scale, which takes the part; without it up to the cameras."""
     from arview.cad import load_part
     from arview.reconstruction.run import ReconstructOptions, reconstruct
 
@@ -74,7 +74,8 @@ def with_arview(photos: Path, part: Path | None) -> PhotoRun:
         steps = Steps.begin("start")
         found = reconstruct(photos, folder, loaded, None, ReconstructOptions(last_stage="scale"), progress=steps)
         steps("end")
-    return PhotoRun(dict(steps.seconds), {"to the scale": len(found.sparse.photos) if found.sparse is not None else 0})
+    kind = "to the scale" if loaded is not None else "to the cameras"
+    return PhotoRun(dict(steps.seconds), {kind: len(found.sparse.photos) if found.sparse is not None else 0})
 
 
 def with_colmap(photos: Path) -> PhotoRun:
