@@ -1,0 +1,1 @@
+"""Named peers beside arview, on the same frames, photos and clouds."""
