@@ -70,6 +70,9 @@ OTHER_SCHEDULES_FINE_SHARE = 0.7
 NEAR_SCHEDULES_MIN_INNER_SHARE = 0.05
 """Share of design edges needed for schedules without colours, because the apparent outline of a rounded part moves with
 the light."""
+FUTILE_FRAMES, FUTILE_SHARE = 6, 0.9
+"""Frames for which other schedules are left out after none of them gained anything, while the score does not fall below
+this share of what it was: a hand or blur stays for a while."""
 FAR_SCHEDULES_SHARE = 0.9
 """Share of the usual score below which schedules for a part that moved far are tried."""
 WIDE_SEARCH_SHARE = 0.8
@@ -255,6 +258,8 @@ class Tracker:
         if self.state.is_started and self._is_usual(frame):
             return
         first = frame.found
+        if self.state.is_futile(first.scores.mean, FUTILE_FRAMES, FUTILE_SHARE):
+            return
         if frame.matches is not None:
             yield Proposal(frame.start, LAST_STAGES, frame.matches, first_level=-1)
             if self.state.is_started and self._is_usual(frame):
@@ -270,6 +275,8 @@ class Tracker:
             if frame.found.evidence.score >= FAR_SCHEDULES_SHARE * self.state.usual_score:
                 return
             yield Proposal(frame.start, stages, frame.matches, MIN_GAIN)
+        if frame.found is first:
+            self.state.futile = (self.state.frames, first.scores.mean)
 
     def _searched(self, frame: FrameContext) -> Iterator[Proposal]:
         """Poses of a wide search around the predicted one, where the best pose so far is suspicious."""

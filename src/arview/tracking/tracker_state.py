@@ -29,6 +29,7 @@ class TrackerState:
         best_contour_support: best recent support of the outline.
         is_started: whether a frame has been tracked since the start.
         frames: tracked since the start.
+        futile: frame in which no other schedule gained anything, and the score there; None: there was none.
         spread_px: standard deviation of the blur of the part's edges, px of the frame; 0 where it is not known.
         motion: how far poses usually are from the predicted ones.
         unknown_twist: (6,) twist on the right of the pose, a turn about an axis of the part of which frames tell
@@ -47,9 +48,14 @@ class TrackerState:
     best_contour_support: float = 0.0
     is_started: bool = False
     frames: int = 0
+    futile: tuple[int, float] | None = None
     spread_px: float = 0.0
     motion: MotionModel = field(default_factory=MotionModel)
     unknown_twist: Array | None = None
+
+    def is_futile(self, score: float, frames: int, share: float) -> bool:
+        """Whether no other schedule gained anything a few frames ago, and the score is hardly lower now."""
+        return self.futile is not None and self.frames - self.futile[0] <= frames and score >= share * self.futile[1]
 
 
 class RefinedPose(NamedTuple):
