@@ -21,9 +21,8 @@ from arview.tracking.self_calibration.adjustment import FocalAdjustment
 from arview.tracking.self_calibration.frame_set import cropped_frame
 
 FIRST_EVERY, EVERY = 6, 60
-"""Frames between two looks, for the first looks and after them; a look costs as much as tracking a frame."""
-FIRST_ESTIMATES = 4
-"""Looks until the focal length is taken to be settled."""
+"""Frames between the first two looks, and the most that they grow to, twofold each time: a look costs as much as
+tracking three frames."""
 MAX_STD = 0.015
 """Relative standard uncertainty above which a frame says too little: flat parts, and small ones."""
 MIN_DIFFERENCE, SMALL_DIFFERENCE = 0.12, 0.035
@@ -83,7 +82,7 @@ class FocalWatch:
         self._part = PartView(views)
         self._adjustment = FocalAdjustment(self._part, camera)
         self._last: FrameFocal | None = None
-        self._estimates = 0
+        self._wait = FIRST_EVERY
 
     def checked(self, image: NDArray[np.uint8], pose: Pose, frames: int, has_jumped: bool = False) -> Pose:
         """The pose of a frame (H,W,3); where the focal length is contradicted it is critical, and says by how much.
@@ -115,8 +114,7 @@ class FocalWatch:
     def _watch(self, image: NDArray[np.uint8], pose: Pose, frames: int) -> None:
         """Look at a frame, and decide by this look and the one before."""
         shown = self._estimate(image, pose)
-        self._estimates += 1
-        self.due = frames + (FIRST_EVERY if self._estimates < FIRST_ESTIMATES else EVERY)
+        self.due, self._wait = frames + self._wait, min(2 * self._wait, EVERY)
         if shown is None:
             return
         before, self._last = self._last, shown
