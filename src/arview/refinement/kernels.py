@@ -11,7 +11,14 @@ from arview.core.kernel import kernel
 from arview.refinement.evidence import edge_evidence, region_evidence
 from arview.refinement.gauss_newton import apply_twist, solve_step, trust_in
 from arview.refinement.modalities.edge import HYPOTHESES, EdgeProfiles, add_edges, measure_edges, weigh_by_color
-from arview.refinement.modalities.region import ColorModel, RegionLines, add_histograms, add_region, measure_region
+from arview.refinement.modalities.region import (
+    ColorModel,
+    RegionLines,
+    add_histograms,
+    add_region,
+    log_odds,
+    measure_region,
+)
 from arview.refinement.modalities.texture import TextureMatches
 from arview.refinement.modalities.texture_matching import add_matches
 from arview.refinement.projection import ProjectedLines, ViewArrays, project_lines
@@ -26,6 +33,8 @@ EVIDENCE_REACH, EVIDENCE_STEP_PX = 10, 1.0
 """Samples to either side of an edge, and their distance, in the profiles of the evidence."""
 EVIDENCE_SCALE, EVIDENCE_REGION_PX = 2, 2.0
 """Pixels per segment, and tolerated displacement, of the lines across the outline in the evidence."""
+MIN_HISTOGRAM_COUNT = 50
+"""Pixels needed on either side of the outline to learn colours."""
 HISTOGRAM_REACH_PX, HISTOGRAM_GAP_PX = 20.0, 1.5
 """Pixels counted to either side of the outline, and left out beside it, in the colour histograms."""
 
@@ -291,6 +300,50 @@ def run_evidence(
         edges.points_in_picture,
         edges.scatter_px,
     )
+
+
+@kernel
+def learn_odds(
+    image: NDArray[np.uint8],
+    colors: ColorModel,
+    part: ViewArrays,
+    cam_from_body: NDArray[np.float64],
+    intrinsics: NDArray[np.float64],
+    step_mm: float,
+) -> bool:
+    """Fill the log odds of colours from the outline at a pose; whether there are enough pixels on either side of it."""
+    fore, back = np.zeros(colors.odds.shape[0]), np.zeros(colors.odds.shape[0])
+    count_colors(image, colors.bin_of, part, cam_from_body, intrinsics, step_mm, fore, back)
+    if min(fore.sum(), back.sum()) < MIN_HISTOGRAM_COUNT:
+        return False
+    log_odds(fore, back, colors.odds)
+    return True
+
+
+@kernel
+def run_fresh(
+    image: NDArray[np.uint8], gray: NDArray[np.uint8], colors: ColorModel, part: ViewArrays,
+    cam_from_body: NDArray[np.float64], intrinsics: NDArray[np.float64], step_mm: float, stages: StageTable,
+    damping: NDArray[np.float64], weights: ModalityWeights, matches: TextureMatches
+) -> NDArray[np.float64]:  # fmt: skip
+    """Refine a pose through some stages, before each of which colours are learned anew; arguments as of `run_stages`.
+
+    Returns:
+        cam_from_body (4,4).
+    """
+    plain = ModalityWeights(0.0, weights.edge, weights.edge_sigma_px, weights.edge_threshold, weights.texture_sigma_px)
+    pose = cam_from_body
+    for s in range(stages.stride.shape[0]):
+        one = StageTable(
+            stages.region_scale[s : s + 1], stages.edge_reach[s : s + 1], stages.edge_step_px[s : s + 1],
+            stages.edge_spread_px[s : s + 1], stages.updates[s : s + 1], stages.region_gain[s : s + 1],
+            stages.stride[s : s + 1],
+        )  # fmt: skip
+        known = learn_odds(image, colors, part, pose, intrinsics, step_mm)
+        pose, _ = run_stages(
+            image, gray, colors, part, pose, intrinsics, step_mm, one, damping, weights if known else plain, matches
+        )
+    return pose
 
 
 @kernel

@@ -18,11 +18,14 @@ from arview.geometry import Array
 from arview.refinement.edge_spread import edge_spread
 from arview.refinement.evidence import EdgeSteps, PoseEvidence
 from arview.refinement.kernels import (
+    MIN_HISTOGRAM_COUNT,
     STEP_SHARE,
     ModalityWeights,
     count_colors,
+    learn_odds,
     run_edge_steps,
     run_evidence,
+    run_fresh,
     run_stages,
 )
 from arview.refinement.modalities.region import BINS, EDGE_FUNCTION, ColorModel, log_odds, value_bins
@@ -56,8 +59,6 @@ MIN_INNER_SHARE = 0.3
 """Share of design edges inside the outline below which colours get more weight."""
 PLAIN_REGION_GAIN = 6.0
 """Extra weight of colours, as a multiple of ``REGION_WEIGHT``, for a part without inner edges."""
-MIN_HISTOGRAM_COUNT = 50
-"""Pixels needed on either side of the outline to learn colours."""
 SIZE_UNIT_PX = 80.0
 """Half diameter in the picture for which the stages are made; a larger part widens them."""
 
@@ -77,6 +78,10 @@ class RefinerOptions:
     shading: ShadingOptions = field(default_factory=ShadingOptions)
 
 
+PLAIN_BINS = value_bins(1.0)
+"""Bins of channel values in a picture as bright as the learned colours."""
+
+
 @dataclass
 class Appearance:
     """Colours of part and background: histograms along the outline and their log odds.
@@ -91,7 +96,7 @@ class Appearance:
     fore: Array = field(default_factory=lambda: np.zeros(BINS**3))
     back: Array = field(default_factory=lambda: np.zeros(BINS**3))
     odds: Array = field(default_factory=lambda: np.zeros(BINS**3))
-    bin_of: NDArray[np.int64] = field(default_factory=lambda: value_bins(1.0))
+    bin_of: NDArray[np.int64] = field(default_factory=lambda: PLAIN_BINS)
     is_known: bool = False
 
     @property
@@ -174,12 +179,11 @@ class PoseRefiner:
         return fore / fore_count, back / back_count
 
     def appearance_at(self, image: NDArray[np.uint8], cam_from_body: Array) -> Appearance:
-        """Colours along the outline at a pose (4,4), learned from this picture only."""
-        appearance = Appearance()
-        colors = self.color_histograms(image, cam_from_body, appearance.bin_of)
-        if colors is not None:
-            appearance.blend(colors, 1.0)
-        return appearance
+        """Colours along the outline at a pose (4,4), of this picture only: their odds, which are not to be blended."""
+        found = Appearance()
+        part, colors = self.part.arrays, found.colors
+        found.is_known = learn_odds(image, colors, part, cam_from_body, self.intrinsics, self._step_mm)
+        return found
 
     def refine(
         self,
@@ -226,10 +230,22 @@ class PoseRefiner:
     ) -> Array:
         """Refine a pose (4,4) of unknown quality: colours are learned anew before every stage, without any memory."""
         unit = max(1.0, self.radius_px(cam_from_body) / SIZE_UNIT_PX)
-        for stage in stages:
-            appearance = self.appearance_at(image, cam_from_body)
-            cam_from_body, _ = self.refine(image, gray, cam_from_body, (stage.widened(unit),), appearance)
-        return cam_from_body
+        table = stage_table(tuple(stage.widened(unit) for stage in stages))
+        return np.asarray(
+            run_fresh(
+                image,
+                gray,
+                Appearance().colors,
+                self.part.arrays,
+                cam_from_body,
+                self.intrinsics,
+                self._step_mm,
+                table,
+                self._damping,
+                self._weights,
+                NO_MATCHES,
+            )
+        )
 
     def refine_shading(self, gray: NDArray[np.uint8], cam_from_body: Array, information: Array) -> tuple[Array, Array]:
         """Refine a pose by the shading of the surface under an unknown light, see `shading`.

@@ -126,6 +126,9 @@ def log_odds(fore: NDArray[np.float64], back: NDArray[np.float64], out: NDArray[
     total_fore = fore.sum() + 1e-9
     total_back = back.sum() + 1e-9
     for i in range(fore.shape[0]):
+        if fore[i] == 0.0 and back[i] == 0.0:
+            out[i] = 0.0
+            continue
         # A pseudo-count limits the odds of rare colours.
         f = fore[i] / total_fore + 2e-4
         b = back[i] / total_back + 2e-4
