@@ -46,6 +46,11 @@ SAME_ALONG = 0.15
 SAME_DEG = 20.0
 """Offset across the line of sight in diameters, offset along it as a share of the distance, and rotation within which
 two hypotheses are one, badly refined."""
+LAST_BUDGETS = (GRADIENTS_ONLY, UNTRIMMED)
+HOPELESS_QUALITY = 0.1
+"""Searches that are left out after the others found no hypothesis of at least this quality."""
+MIN_MORE_QUALITY = 0.01
+"""Gain by a wider search below which no wider one follows for a result that is good enough, if not sure."""
 NEARBY_ASIDE = 0.35
 NEARBY_ALONG = 0.25
 """Offsets within which competing hypotheses are at the same place."""
@@ -251,15 +256,20 @@ class Detector:
         min_quality = max(o.min_quick_quality, o.min_quality)
         if searches is None:
             searches = [0, *self.wider_searches] if is_thorough else [0]
+        quality = 0.0
         for budget in (o.budgets[k] for k in searches):
+            if budget in LAST_BUDGETS and quality < HOPELESS_QUALITY and hypotheses:
+                break
             starts = local.pattern_search(pyramid, self.global_search.starts(pyramid, budget), budget.kept)
             found = local.refine_and_verify(pyramid, starts)
             hypotheses = local.deduplicate([*hypotheses, *found], DISTINCT_DEG)
-            if hypotheses and self.qualities(hypotheses)[0] < min_quality:
+            before, quality = quality, self.qualities(hypotheses)[0] if hypotheses else 0.0
+            if hypotheses and quality < min_quality:
                 # The search may have found a near-symmetric pose of the right one, which fits worse.
                 counterparts = self.disambiguator.counterparts(pyramid, hypotheses[0])
                 hypotheses = local.deduplicate([*hypotheses, *counterparts], DISTINCT_DEG)
-            if hypotheses and self.qualities(hypotheses)[0] >= min_quality:
+                quality = self.qualities(hypotheses)[0]
+            if quality >= min_quality or (o.min_quality <= quality <= before + MIN_MORE_QUALITY):
                 break
         return hypotheses
 

@@ -25,6 +25,9 @@ from arview.refinement import ViewArrays, nearest_view
 MAX_OUTLINE_REACH = 1.4
 """Half diameters from the part's centre within which its outline lies in the image; near parts reach beyond 1."""
 
+WORTH_SHIFTING = 0.85
+"""Share of the best response so far that an outline must have where it is, to be tried with shifts, too."""
+
 
 @kernel
 def pose_score(
@@ -171,6 +174,7 @@ def outline_score(
     buffer: NDArray[np.int64],
     sums: NDArray[np.int32],
     sectors: NDArray[np.int64],
+    best_so_far: float,
 ) -> tuple[float, int, int]:
     """Mean response 0–1 of an outline at a roll, size and place, and the best shift dx, dy in px.
 
@@ -187,22 +191,29 @@ def outline_score(
         min_cut_px: half diameter from which an outline that reaches into that border is scored by its points inside.
         floor: typical response, see `visible_score`.
         buffer, sums, sectors: work buffers (3,N) int64, (S,S) int32 and (SECTORS,) int64.
+        best_so_far: score that is to be exceeded; 0 is returned without shifts where that is unlikely.
     """
     a, b = np.float32(radius_px * np.cos(roll)), np.float32(radius_px * np.sin(roll))
     turn = int(np.round(roll * (256.0 / np.pi))) + 16
     left, top = np.float32(x0 + 0.5), np.float32(y0 + 0.5)
+    height, width = maps.shape[1], maps.shape[2]
+    unshifted = 0
     for i in range(points.shape[0]):
         scale = np.float32(1.0) / (np.float32(1.0) + np.float32(nearness) * points[i, 2])
         x, y = points[i, 0] * scale, points[i, 1] * scale
         buffer[0, i] = int(np.floor(a * x - b * y + left))
         buffer[1, i] = int(np.floor(b * x + a * y + top))
         buffer[2, i] = ((angles[i] + turn) >> 5) & 7
+        column, row = buffer[0, i], buffer[1, i]
+        if 0 <= column < width and 0 <= row < height:
+            unshifted += np.int64(maps[buffer[2, i], row, column])
     count = points.shape[0]
-    best, dx, dy = best_shift(maps, buffer, count, shift_px, shift_step, sums)
     counted = count * (1.0 - TRIMMED_SHARE) if is_trimmed else 1.0 * count
+    if unshifted < WORTH_SHIFTING * best_so_far * 255.0 * counted:
+        return 0.0, 0, 0
+    best, dx, dy = best_shift(maps, buffer, count, shift_px, shift_step, sums)
     total = 1.0 * (_trimmed_sum(maps, buffer, count, dx, dy, sectors) if is_trimmed else best)
     score = total / (255.0 * counted)
-    height, width = maps.shape[1], maps.shape[2]
     reach = radius_px * MAX_OUTLINE_REACH + pad_px
     if radius_px < min_cut_px or (reach <= x0 < width - reach and reach <= y0 < height - reach):
         return score, dx, dy
@@ -266,7 +277,7 @@ def search_outlines(
         view, roll, radius = views[n], rolls[n], radii_px[n]
         best, dx, dy = outline_score(
             maps, points[view], angles[view], roll, radius, radius / focal_px, places[n, 0], places[n, 1],
-            shift_px, shift_step, is_trimmed, pad_px, min_cut_px, floor, buffer, sums, sectors,
+            shift_px, shift_step, is_trimmed, pad_px, min_cut_px, floor, buffer, sums, sectors, 0.0,
         )  # fmt: skip
         x, y = places[n, 0] + dx, places[n, 1] + dy
         for _ in range(rounds):
@@ -282,7 +293,7 @@ def search_outlines(
                     r += turns[view, step - 4]
                 score, dx, dy = outline_score(
                     maps, points[v], angles[v], r, s, s / focal_px, x, y,
-                    shift_px, shift_step, is_trimmed, pad_px, min_cut_px, floor, buffer, sums, sectors,
+                    shift_px, shift_step, is_trimmed, pad_px, min_cut_px, floor, buffer, sums, sectors, best,
                 )  # fmt: skip
                 if score > best:
                     best = score
