@@ -6,6 +6,7 @@ confirm, and those that are not verified are also searched for at alternative pl
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import NamedTuple
 
 import cv2
@@ -123,10 +124,15 @@ class ComponentObserver:
         self._base_edges = VisibleEdgeCache(views, make_model(base.name, (base,)))
         self._places = BarePlaceMeter(views.surface, self._count, views.diameter_mm)
         self._edge_net, self._presence_net = EdgeNet(), PresenceNet()
-        placements = alternative_placements(model)
-        self._search = PlacementSearch(placements, views.surface, views.diameter_mm, self._presence_net)
+        self._model = model
         low, high = model.bounds_in_model
         self._corners_in_model = np.array([[(low, high)[i >> k & 1][k] for k in range(3)] for i in range(8)])
+
+    @cached_property
+    def _search(self) -> PlacementSearch:
+        """The search for components at other placements, made when one is first searched for."""
+        placements = alternative_placements(self._model)
+        return PlacementSearch(placements, self._surface, self._diameter_mm, self._presence_net)
 
     def shows_more(self, image: NDArray[np.uint8], pose: Array, than: Array) -> bool:
         """Whether a picture shows more components at a pose (4,4) than at another."""

@@ -77,7 +77,7 @@ class GuideView:
     features: ViewFeatures
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class GuideViewSet:
     """All guide views of a model.
 

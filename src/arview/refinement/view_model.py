@@ -8,6 +8,7 @@ missed or confused with each other, and a test that expects them rejects right p
 from __future__ import annotations
 
 from functools import cached_property
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,12 +77,22 @@ class PartView:
         self.is_curved = curved_share(self.surface) >= MIN_CURVED_SHARE
         self.corner_normals = corner_normals(self.surface)
 
+    @classmethod
+    def of(cls, views: GuideViewSet) -> PartView:
+        """The part of guide views, made once for all that use these views."""
+        if views not in _shared:
+            _shared[views] = cls(views)
+        return _shared[views]
+
     @cached_property
     def resolvable(self) -> ViewArrays:
         """``arrays`` in which unresolvable design edges are not marked as design edges."""
         kinds = np.array(self.views.arrays["edge_kinds"])
         kinds[find_unresolvable(self.views)] &= np.uint8(255 - EDGE_SHARP)
         return self.arrays._replace(edge_kinds=kinds)
+
+
+_shared: WeakKeyDictionary[GuideViewSet, PartView] = WeakKeyDictionary()
 
 
 def _without_rough(kinds: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -131,7 +142,7 @@ def _mark_unresolvable(
         right = np.cross(way, helper)
         right /= np.sqrt((right * right).sum())
         down = np.cross(way, right)
-        flat = np.empty((last - first, 4), dtype=np.float32)
+        flat = np.empty((4, last - first), dtype=np.float32)
         count = 0
         index = np.empty(last - first, dtype=np.int64)
         for k in range(first, last):
@@ -146,18 +157,19 @@ def _mark_unresolvable(
             length = np.sqrt(tx * tx + ty * ty)
             if length < np.float32(END_ON):
                 continue
-            flat[count, 0], flat[count, 1] = x, y
-            flat[count, 2], flat[count, 3] = tx / length, ty / length
+            flat[0, count], flat[1, count] = x, y
+            flat[2, count], flat[3, count] = tx / length, ty / length
             index[count] = k
             count += 1
         for i in range(count):
+            px, py, tx, ty = flat[0, i], flat[1, i], flat[2, i], flat[3, i]
+            neighbours = 0
+            # Without branches, so that the compiler compares eight at once.
             for j in range(count):
-                x, y = flat[j, 0] - flat[i, 0], flat[j, 1] - flat[i, 1]
-                beside = abs(x * flat[i, 3] - y * flat[i, 2])
-                if beside < nearest or beside > furthest:
-                    continue
-                if abs(x * flat[i, 2] + y * flat[i, 3]) > along:
-                    continue
-                if abs(flat[i, 2] * flat[j, 2] + flat[i, 3] * flat[j, 3]) > np.float32(PARALLEL_COS):
-                    unresolvable[index[i]] = True
-                    break
+                x, y = flat[0, j] - px, flat[1, j] - py
+                beside = abs(x * ty - y * tx)
+                is_beside = (beside >= nearest) & (beside <= furthest)
+                is_along = abs(x * tx + y * ty) <= along
+                is_parallel = abs(tx * flat[2, j] + ty * flat[3, j]) > np.float32(PARALLEL_COS)
+                neighbours += int(is_beside & is_along & is_parallel)
+            unresolvable[index[i]] = neighbours > 0

@@ -147,7 +147,7 @@ class Tracker:
         check_type(model, (Model, NoneType), "Tracker: model")
         self.options = options or TrackerOptions()
         self.camera = camera
-        part = part or PartView(views)
+        part = part or PartView.of(views)
         self.refiner = PoseRefiner(part, camera, self.options)
         # Only edges gain from an enlarged picture.
         self._recheck = recheck

@@ -179,7 +179,7 @@ class LocalSearch:
         self.views = views
         self.camera = camera
         self.options = options or LocalSearchOptions()
-        self.refiner = PoseRefiner(PartView(views), camera)
+        self.refiner = PoseRefiner(PartView.of(views), camera)
         part = self.refiner.part
         self._distances_mm = distances_mm
         self.reduced_camera = self._reduced(camera)

@@ -229,13 +229,13 @@ def _nearest_views(views: GuideViewSet, subdivisions: int) -> NDArray[np.intp]:
     inside = views.view_range.contains_direction(wanted, 3.0)
     if not inside.any():
         return np.arange(len(views))
-    return np.unique(np.argmax(wanted[inside] @ views.directions.T, axis=1))
+    return np.unique(KDTree(views.directions).query(wanted[inside])[1])
 
 
 def outlines_near_icosphere(views: GuideViewSet, outlines: ViewOutlines, subdivisions: int) -> NDArray[np.intp]:
     """Indices of the outlines nearest to the directions of an icosphere of some icosahedron level."""
     wanted = np.stack([views.view(int(i)).cam_from_model[2, :3] for i in _nearest_views(views, subdivisions)])
-    return np.unique(np.argmax(wanted @ outlines.rotations[:, 2].T, axis=1))
+    return np.unique(KDTree(outlines.rotations[:, 2]).query(wanted)[1])
 
 
 def in_fundamental_domain(

@@ -133,7 +133,7 @@ class GuidedInit:
         self.camera = camera
         self._views = views
         self._center_in_model = views.center_in_model
-        self._refiner = PoseRefiner(PartView(views), camera)
+        self._refiner = PoseRefiner(PartView.of(views), camera)
         part, diameter_mm = self._refiner.part.arrays, self._refiner.diameter_mm
         points = {"contour_points": CONTOUR_POINTS, "design_points": DESIGN_POINTS}
         self._near = NearSearch(part, camera, diameter_mm, **points)

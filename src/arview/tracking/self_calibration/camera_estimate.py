@@ -35,7 +35,7 @@ class CameraEstimate:
 
     def __init__(self, views: GuideViewSet, guess: Camera) -> None:
         self.last: FocalEstimate | None = None
-        self._part = PartView(views)
+        self._part = PartView.of(views)
         self._estimator = FocalEstimator(self._part, guess)
         self._cameras: list[tuple[int, Camera]] = [(0, guess)]
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="arview-focal")

@@ -77,9 +77,9 @@ class FocalWatch:
     def __init__(self, views: GuideViewSet, camera: Camera) -> None:
         self.contradiction: FrameFocal | None = None
         self.has_changed = False
-        self.due = 0
+        self.due = 1
         self._camera = camera
-        self._part = PartView(views)
+        self._part = PartView.of(views)
         self._adjustment = FocalAdjustment(self._part, camera)
         self._last: FrameFocal | None = None
         self._wait = FIRST_EVERY
