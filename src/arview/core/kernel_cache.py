@@ -14,9 +14,11 @@ import time
 import types as python_types
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+import llvmlite.binding as llvm
 import numba
 import numpy as np
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataCacheFile, NullCache
@@ -26,6 +28,8 @@ from arview.core.cache_folder import cache_folder
 
 MAX_UNUSED_DAYS = 30.0
 """Compiled code that has not been used for longer is deleted by `prune_kernels`."""
+_FORMAT = "2"
+"""Of the files, see `_DigestImpl`."""
 _OPTIONS = "kernel_options"
 """Attribute of a kernel's function that holds its compiler options as text."""
 
@@ -84,7 +88,37 @@ class _DigestLocator:
 
 
 class _DigestImpl(CompileResultCacheImpl):
+    """What is stored of a kernel: its machine code, and LLVM's code for other kernels that are compiled with it.
+
+    Numba reads the latter whenever it loads a kernel, which takes longer than all else. Here it is read when another
+    kernel is compiled; the names that it defines are stored beside it.
+    """
+
     _locator_classes = (_DigestLocator,)
+
+    def reduce(self, data: Any) -> Any:
+        library, *others = super().reduce(data)
+        name, kind, code = library
+        if kind == "object":
+            module = llvm.parse_bitcode(code[1])
+            defined = [one.name for one in (*module.functions, *module.global_variables) if not one.is_declaration]
+            code = (*code, defined)
+        return (name, kind, code), *others
+
+    def rebuild(self, target_context: Any, payload: Any) -> Any:
+        (name, kind, code), *others = payload
+        if kind != "object":
+            return super().rebuild(target_context, payload)
+        machine_code, bitcode, defined = code
+        target_context.codegen()._engine._defined_symbols.update(defined)
+        result = super().rebuild(target_context, ((name, kind, (machine_code, _empty_bitcode())), *others))
+        result.library._get_module_for_linking = lru_cache(maxsize=1)(lambda: llvm.parse_bitcode(bitcode))
+        return result
+
+
+@lru_cache(maxsize=1)
+def _empty_bitcode() -> bytes:
+    return bytes(llvm.parse_assembly("").as_bitcode())
 
 
 class _CacheFile(IndexDataCacheFile):
@@ -123,7 +157,7 @@ def _locked(path: Path) -> Iterator[None]:
 
 def kernel_digest(function: Callable[..., Any]) -> str:
     """Hash of all that a kernel's machine code depends on: its byte code, constants, callees, numba's version."""
-    parts = [numba.__version__, np.__version__]
+    parts = [_FORMAT, numba.__version__, np.__version__]
     _describe(function, parts, set())
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()
 
