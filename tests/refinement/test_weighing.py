@@ -30,6 +30,10 @@ def colors() -> ColorModel:
     return ColorModel(bin_of, odds, EDGE_FUNCTION)
 
 
+INTRINSICS = np.array([500.0, 500.0, *np.zeros(8), 1.0])
+"""Of which only the focal length and the pitch are used."""
+
+
 def picture(*, outline: float = OUTLINE, noise: float = 3.0) -> np.ndarray:
     """Picture (100,200,3) of a part to the left of a column, with a glaring stripe along its rim."""
     image = np.empty((100, 200, 3))
@@ -58,12 +62,12 @@ def test_highlight_loses_against_round_outline(kind):
     image = picture()
     gray = smoothed(np.ascontiguousarray(image.mean(axis=2).astype(np.uint8)))
     expected = lines(OUTLINE - 1.0)
-    profiles = measure_edges(gray, expected, 8, 1.0, 3.0)
+    profiles = measure_edges(gray, expected, 8, 1.0, 3.0, 1.0)
     assert profiles.visible.all()
     # The highlight is the stronger step by far, 5 px inside the outline.
     assert np.median(strongest(profiles)) < -2.0
     before = profiles.strengths.copy()
-    weigh_by_color(image, colors(), expected, np.full(len(ROWS), kind, dtype=np.uint8), profiles)
+    weigh_by_color(image, colors(), expected, np.full(len(ROWS), kind, dtype=np.uint8), profiles, 1.0)
     if kind & EDGE_SHARP:
         assert np.array_equal(profiles.strengths, before)
     else:
@@ -76,10 +80,10 @@ def test_highlight_loses_against_round_outline(kind):
 def test_steps_keep_their_strength_where_colors_tell_nothing():
     image = picture()
     gray = smoothed(np.ascontiguousarray(image.mean(axis=2).astype(np.uint8)))
-    profiles = measure_edges(gray, lines(OUTLINE), 8, 1.0, 3.0)
+    profiles = measure_edges(gray, lines(OUTLINE), 8, 1.0, 3.0, 1.0)
     before = profiles.strengths.copy()
     unknown = colors()._replace(odds=np.zeros(BINS**3))
-    weigh_by_color(image, unknown, lines(OUTLINE), np.full(len(ROWS), EDGE_CONTOUR, dtype=np.uint8), profiles)
+    weigh_by_color(image, unknown, lines(OUTLINE), np.full(len(ROWS), EDGE_CONTOUR, dtype=np.uint8), profiles, 1.0)
     assert np.count_nonzero(before) > len(ROWS) and np.allclose(profiles.strengths, before)
 
 
@@ -88,9 +92,9 @@ def test_line_that_the_outline_does_not_cross_is_recognised(scale):
     runs = np.full((len(ROWS), 2), 1000.0, dtype=np.float32)
     image = picture(outline=150.0)
     image[:, 80:100] = RED
-    crossed = measure_region(image, colors(), lines(151.0), runs, 500.0, scale)
+    crossed = measure_region(image, colors(), lines(151.0), runs, INTRINSICS, scale)
     assert crossed.crossing.min() > 0.99 and np.abs(crossed.mean).max() < 1.5 * scale
-    inside = measure_region(image, colors(), lines(115.0), runs, 500.0, scale)
+    inside = measure_region(image, colors(), lines(115.0), runs, INTRINSICS, scale)
     # The posterior of such a line is narrow as well, at its end; only the comparison with no outline reveals it.
     assert inside.information.min() > 0.1 / scale**2 and inside.mean.min() > 3.0 * scale
     assert inside.crossing.max() < 0.05

@@ -57,11 +57,12 @@ def test_a_spot_lies_where_the_camera_of_the_window_projects_it(scale: float) ->
         spot = 250.0 * np.exp(-0.5 * ((u - center[0]) ** 2 + (v - center[1]) ** 2) / 3.0**2)
         image = np.maximum(image, spot[..., None].astype(np.uint8))
     picture = working_picture(image, CAMERA, scale, (233.0, 171.0, 421.0, 303.0))
-    assert picture.image.shape[:2] == picture.smooth.shape == (picture.camera.height, picture.camera.width)
-    assert picture.camera.fx / CAMERA.fx == pytest.approx(scale, rel=0.02)
+    assert picture.image.shape[:2] == picture.smooth.shape
+    assert picture.smooth.shape[1] == pytest.approx(picture.pitch * picture.camera.width, abs=1.0)
+    assert picture.camera.fx / CAMERA.fx == pytest.approx(scale, rel=1e-9)
     for point in points:
-        x, y = picture.camera.project(point)
-        reach = max(3, round(7 * scale))
+        x, y = (picture.camera.project(point) + 0.5) * picture.pitch - 0.5
+        reach = max(3, round(7 * scale * picture.pitch))
         left, top = round(x) - reach, round(y) - reach
         crop = picture.smooth[top : top + 2 * reach + 1, left : left + 2 * reach + 1].astype(float)
         rows, columns = np.mgrid[: crop.shape[0], : crop.shape[1]]

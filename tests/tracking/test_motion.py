@@ -10,7 +10,10 @@ from arview.tracking.motion import MotionModel, innovation, normalised_covarianc
 
 DIAMETER_MM = 150.0
 POSE = rigid(exp_so3([0.3, -0.5, 0.2]), [20.0, -30.0, 600.0])
-CERTAIN = np.zeros((6, 6))
+
+
+def certain() -> Array:
+    return np.zeros((6, 6))
 
 
 def moved(turn_deg: Array, shift_mm: Array) -> Array:
@@ -40,29 +43,29 @@ def test_what_a_hand_does_is_seldom_unusual_and_a_jump_always_is(sigma_deg: floa
         model = MotionModel()
         unusual = 0
         for number, difference in enumerate(stream(sigma_deg, sigma_mm, 400, seed)):
-            is_unusual = model.is_unusual(difference, CERTAIN)
+            is_unusual = model.is_unusual(difference, certain)
             unusual += number >= 40 and is_unusual
-            model.learn(difference, CERTAIN, is_confirmed=is_unusual)
+            model.learn(difference, is_unusual, is_confirmed=is_unusual)
         assert unusual <= 0.08 * 360
-        assert model.is_unusual(jump, CERTAIN)
+        assert model.is_unusual(jump, certain)
 
 
 def test_the_same_motion_is_unusual_for_a_steady_hand_and_usual_for_a_restless_one() -> None:
     start = innovation(moved(np.array([0.0, 0.0, 6.0]), np.zeros(3)), POSE, DIAMETER_MM)
     steady, restless = MotionModel(), MotionModel()
     for calm, wild in zip(stream(0.3, 0.5, 60, 1), stream(2.5, 4.0, 60, 1), strict=True):
-        steady.learn(calm, CERTAIN)
-        restless.learn(wild, CERTAIN)
-    assert steady.is_unusual(start, CERTAIN)
-    assert not restless.is_unusual(start, CERTAIN)
+        steady.learn(calm, False)
+        restless.learn(wild, False)
+    assert steady.is_unusual(start, certain)
+    assert not restless.is_unusual(start, certain)
 
 
 def test_a_jump_that_is_not_confirmed_hardly_counts_and_a_confirmed_one_does() -> None:
     jump = innovation(moved(np.array([0.0, 15.0, 0.0]), np.zeros(3)), POSE, DIAMETER_MM)
     doubted, confirmed = MotionModel(), MotionModel()
     before = doubted.covariance
-    doubted.learn(jump, CERTAIN)
-    confirmed.learn(jump, CERTAIN, is_confirmed=True)
+    doubted.learn(jump, True)
+    confirmed.learn(jump, True, is_confirmed=True)
     assert np.trace(doubted.covariance) < 1.4 * np.trace(before)
     assert np.trace(confirmed.covariance) > 1.5 * np.trace(before)
 
@@ -76,8 +79,8 @@ def test_a_motion_that_the_covariance_of_the_pose_explains_is_not_unusual() -> N
     covariance = normalised_covariance(twist_covariance, POSE, DIAMETER_MM)
     assert covariance[5, 5] == pytest.approx((15.0 / (0.7 * DIAMETER_MM)) ** 2, rel=1e-6)
     model = MotionModel()
-    assert model.is_unusual(difference, CERTAIN)
-    assert not model.is_unusual(difference, covariance)
+    assert model.is_unusual(difference, certain)
+    assert not model.is_unusual(difference, lambda: covariance)
 
 
 def test_one_jump_is_borne_and_several_make_the_motion_restless() -> None:
@@ -85,11 +88,11 @@ def test_one_jump_is_borne_and_several_make_the_motion_restless() -> None:
     still = np.zeros(6)
     model = MotionModel()
     assert model.is_calm and not model.is_restless
-    model.learn(jump, CERTAIN)
+    model.learn(jump, model.is_unusual(jump, certain))
     assert not model.is_calm and not model.is_restless
-    model.learn(still, CERTAIN)
-    model.learn(jump, CERTAIN)
+    model.learn(still, model.is_unusual(still, certain))
+    model.learn(jump, model.is_unusual(jump, certain))
     assert model.is_restless
     for _ in range(5):
-        model.learn(still, CERTAIN)
+        model.learn(still, model.is_unusual(still, certain))
     assert model.is_calm and not model.is_restless

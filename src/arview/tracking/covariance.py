@@ -43,7 +43,7 @@ def common_covariance(cam_from_body: Array, radius_px: float, diameter_mm: float
     """
     r = cam_from_body
     distance_mm, mm_per_px = max(r[2, 3], 1.0), 0.5 * diameter_mm / radius_px
-    shift_mm = r[:3, :3] @ motion[3:]
+    shift_mm = np.ascontiguousarray(r[:3, :3]) @ np.ascontiguousarray(motion[3:])
     turned_px = radius_px * np.sqrt((motion[:3] * motion[:3]).sum() + (shift_mm[2] / distance_mm) ** 2)
     motion_px = np.sqrt(turned_px**2 + (shift_mm[0] / mm_per_px) ** 2 + (shift_mm[1] / mm_per_px) ** 2)
     shift_px = np.hypot(COMMON_SHIFT_PX, MOTION_SHIFT * motion_px)

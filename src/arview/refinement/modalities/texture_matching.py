@@ -392,14 +392,15 @@ def nearest_pose(poses: NDArray[np.float64], cam_from_body: NDArray[np.float64])
     """Pose (N,4,4) nearest in direction of view, roll and distance, and its distance in the steps for new keyframes."""
     best, least = 0, np.inf
     b = cam_from_body
-    eye = b[:3, :3].T @ b[:3, 3]
+    eye = np.ascontiguousarray(b[:3, :3].T) @ np.ascontiguousarray(b[:3, 3])
     distance = np.sqrt((eye * eye).sum())
     for k in range(poses.shape[0]):
         a = poses[k]
-        other = a[:3, :3].T @ a[:3, 3]
+        back = np.ascontiguousarray(a[:3, :3].T)
+        other = back @ np.ascontiguousarray(a[:3, 3])
         range_mm = np.sqrt((other * other).sum())
         view = np.arccos(min(max((eye * other).sum() / (range_mm * distance), -1.0), 1.0))
-        turn = b[:3, :3] @ a[:3, :3].T
+        turn = np.ascontiguousarray(b[:3, :3]) @ back
         roll = abs(np.arctan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1]))
         scale = abs(np.log(distance / range_mm)) / np.log(1.0 + SCALE_STEP)
         steps = max(view / VIEW_STEP_RAD, roll / ROLL_STEP_RAD, scale)

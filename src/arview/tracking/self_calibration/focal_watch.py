@@ -77,7 +77,7 @@ class FocalWatch:
     def __init__(self, views: GuideViewSet, camera: Camera) -> None:
         self.contradiction: FrameFocal | None = None
         self.has_changed = False
-        self.due = 1
+        self.due = 3
         self._camera = camera
         self._part = PartView.of(views)
         self._adjustment = FocalAdjustment(self._part, camera)
