@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
 
 import click
 
@@ -12,10 +11,8 @@ from arview import workflow
 from arview.cli.common import UNIT, main, say
 from arview.cli.exit_codes import ExitCode, exit_code_of
 from arview.core.progress import Progress, check_stop
+from arview.inspection import Inspection, overall_verdict, verdict_sentence
 from arview.quality import history
-
-if TYPE_CHECKING:
-    pass
 
 
 @main.command(
@@ -83,6 +80,7 @@ Examples:
     help="Frames to measure of a video without photos.",
 )
 @click.option("--no-repeatability", is_flag=True, help="Do not measure two halves of the photos apart to compare them.")
+@click.option("--no-cloud", is_flag=True, help="Measure in the photos only: no dense cloud, no foreign objects.")
 @click.option("--no-pdf", is_flag=True, help="Write the report as HTML only.")
 @click.option(
     "--seed", type=click.IntRange(min=0), default=0, show_default=True, help="The same seed gives the same cloud."
@@ -115,6 +113,7 @@ def inspect(
     guard: float,
     max_frames: int,
     no_repeatability: bool,
+    no_cloud: bool,
     no_pdf: bool,
     seed: int,
     threads: int,
@@ -141,6 +140,7 @@ def inspect(
         threads=threads,
         device=device,
         makes_pdf=not no_pdf,
+        makes_cloud=not no_cloud,
         compares_halves=not no_repeatability,
         pairs=pairs,
     )
@@ -148,8 +148,8 @@ def inspect(
         history.HistoryStore(
             store, tell=say
         ).close()  # a store that cannot be used is reported now, not after the measurement
-    with line_bar(video is not None, photos is None, not no_pdf) as progress:
-        outcome = workflow.inspect_part(job, output, progress=progress, starts_over=force)
+    with line_bar(job) as progress:
+        outcome = workflow.inspect_part(job, output, progress=progress, starts_over=force, on_verdict=say_verdict)
     print_outcome(outcome)
     if store is not None:
         with history.HistoryStore(store, tell=say) as opened:
@@ -158,6 +158,12 @@ def inspect(
             click.echo(f"history: {state} {added.id} in {opened.name}")
     click.echo(f"{outcome.inspection.part} {outcome.inspection.serial}".rstrip() + f": {word(outcome)}")
     click.get_current_context().exit(exit_code_of(outcome.verdict.value))
+
+
+def say_verdict(inspection: Inspection) -> None:
+    """Say the verdict by the photos, while cloud, report and film are still made."""
+    verdict = overall_verdict(inspection).value.replace("_", " ").upper()
+    say(f"by the photos: {verdict}; {verdict_sentence(inspection)}")
 
 
 def word(outcome: workflow.Outcome) -> str:
@@ -185,7 +191,7 @@ def print_outcome(outcome: workflow.Outcome) -> None:
 
 
 @contextmanager
-def line_bar(has_film: bool, is_from_video: bool, has_pdf: bool) -> Iterator[Progress]:
+def line_bar(job: workflow.InspectJob) -> Iterator[Progress]:
     """Show one bar for all stages, with the time left, if stderr is a terminal."""
     from tqdm import tqdm
 
@@ -196,4 +202,5 @@ def line_bar(has_film: bool, is_from_video: bool, has_pdf: bool) -> Iterator[Pro
             bar.set_description_str(f"{moment.step:18}{workflow.time_text(moment):>18}", refresh=False)
             bar.update(100.0 * moment.share - bar.n)
 
-        yield workflow.ProgressEstimator(show, is_from_video, has_film, has_pdf).update
+        has_film = job.video is not None
+        yield workflow.ProgressEstimator(show, job.is_from_video, has_film, job.makes_pdf, job.makes_cloud).update

@@ -69,11 +69,11 @@ def measure_again(
     with threadpool_limits(1, "blas"):
         views = load_views(earlier, part.model)
         first = replace(reconstruction, sparse=earlier)
-        datums = measure_all(first, views, part, base, options, tell)
+        datums = measure_all(first, views, part, base, options, tell, {})
         tell("datums", 0, 1)
         alignment, failed = align_to_datums(first, views, part, base, datums)
         results = measure_all(
-            replace(reconstruction, sparse=later), load_views(later, part.model), part, components, options, tell
+            replace(reconstruction, sparse=later), load_views(later, part.model), part, components, options, tell, {}
         )
         poses = None
         if sparse.pose_covariance is not None:

@@ -31,6 +31,7 @@ from arview.measurement.look_alikes import with_unsure_names
 from arview.measurement.measurand import measurand_of
 from arview.measurement.options import ComponentMeasurement, MeasureOptions, combined_of
 from arview.measurement.photo import PhotoViews, load_views, measure_components_in_photos
+from arview.measurement.photo.measure import MethodResults
 from arview.measurement.photo.patches import turning_center
 from arview.measurement.records import (
     component_record,
@@ -64,6 +65,7 @@ def measure(
     options: MeasureOptions | None = None,
     *,
     progress: Progress | None = None,
+    known: dict[str, MethodResults] | None = None,
 ) -> Inspection:
     """Measure every inspected component in the datum frame, with its uncertainty and verdict.
 
@@ -72,6 +74,8 @@ def measure(
         part: CAD, roles, tolerances, datums.
         options: see `MeasureOptions`.
         progress: called with (what, done, total).
+        known: what the methods by photos found of each component in the same reconstruction; an empty one is filled, so
+            that a measurement with the cloud need not repeat it.
 
     Raises:
         InputError: the reconstruction contradicts the CAD, a datum is not covered, or there is nothing to inspect.
@@ -83,10 +87,17 @@ def measure(
         reconstruction = read_folder(reconstruction)
     # One thread for BLAS: work is parallel over components, and the matrices have only some hundred rows.
     with threadpool_limits(1, "blas"):
-        return _measure(reconstruction, part, options or MeasureOptions(), progress or (lambda what, done, total: None))
+        tell = progress or (lambda what, done, total: None)
+        return _measure(reconstruction, part, options or MeasureOptions(), tell, {} if known is None else known)
 
 
-def _measure(reconstruction: MetricReconstruction, part: Part, options: MeasureOptions, tell: Progress) -> Inspection:
+def _measure(
+    reconstruction: MetricReconstruction,
+    part: Part,
+    options: MeasureOptions,
+    tell: Progress,
+    known: dict[str, MethodResults],
+) -> Inspection:
     """The steps of `measure`, on the rough frame of the reconstruction."""
     began, warnings = time.process_time(), list(reconstruction.scale.warnings)
     consistency = reconstruction.scale.consistency
@@ -106,7 +117,7 @@ def _measure(reconstruction: MetricReconstruction, part: Part, options: MeasureO
     if not has_photos and "cloud" not in options.methods:
         raise InputError("a cloud without photos can only be measured by the method 'cloud'")
     views = load_views(replace(reconstruction.sparse, pose_covariance=None), part.model) if has_photos else None
-    results = measure_all(reconstruction, views, part, [*base, *names], options, tell)
+    results = measure_all(reconstruction, views, part, [*base, *names], options, tell, known)
     tell("datums", 0, 1)
     alignment, failed = align_to_datums(reconstruction, views, part, base, results)
     warnings += [*(failed_datum_text(one) for one in failed), *datum_doubts(alignment)]
@@ -158,16 +169,18 @@ def measure_all(
     names: Sequence[str],
     options: MeasureOptions,
     tell: Progress,
+    known: dict[str, MethodResults],
 ) -> dict[str, ComponentMeasurement]:
-    """Measure every component by every requested method, in the rough frame."""
+    """Measure every component by every requested method, in the rough frame; for ``known`` see `measure`."""
     found: dict[str, list[Move | NotMeasured]] = {name: [] for name in names}
     if views is not None and {"sweep", "edges"} & set(options.methods):
 
         def step(name: str, share: float) -> None:
             tell("components", round(share * len(names)), len(names))
 
-        both = measure_components_in_photos(views, part, part.model, step, names)
-        for name, by_method in both.items():
+        if not known:
+            known.update(measure_components_in_photos(views, part, part.model, step, names))
+        for name, by_method in known.items():
             found[name] += [by_method[method] for method in options.methods if method in by_method]
     if "cloud" in options.methods and reconstruction.cloud is not None:
         from arview.measurement.cloud.deviation import measure_components_in_cloud

@@ -37,6 +37,7 @@ class InspectJob:
     threads: int = 0  # threads of the reconstruction; 0: all cores
     device: str = "auto"  # device of features, matching and the dense cloud
     makes_pdf: bool = True
+    makes_cloud: bool = True  # make a dense cloud and measure in it, too, after the verdict by the photos
     compares_halves: bool = True  # measure two halves of the photos apart and compare them
     pairs: str | None = None  # the sparse/pairs.json of another run, whose pairs of photos are matched
 

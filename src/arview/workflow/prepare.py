@@ -65,8 +65,11 @@ def prepare(job: InspectJob, folder: Path) -> Prepared:
         silhouettes=CadSilhouettes(part) if job.masks == reconstruction.AUTO else None,
         known=reconstruction.read_pairs(job.pairs) if job.pairs else reconstruction.KnownPairs(),
         needs_scale=True,
+        last_stage="dense" if job.makes_cloud else "scale",
     )
+    methods = measurement.MeasureOptions().methods
     measure = measurement.MeasureOptions(
+        methods=methods if job.makes_cloud else tuple(one for one in methods if one != "cloud"),
         tolerance_mm=job.tolerance_mm,
         maps_folder=folder / "inspection_distances",
         decision=measurement.DecisionOptions(job.guard),
@@ -106,6 +109,7 @@ def measurement_key(prepared: Prepared) -> str:
         made,
         poses,
         job.compares_halves,
+        *(() if job.makes_cloud else ("no cloud",)),
         _content(job.camera),
         part.model.source_hash,
         part.name,

@@ -18,13 +18,13 @@ STEPS: tuple[tuple[str, float], ...] = (
     ("finding the part", 2.0),
     ("reading photos", 1.0),
     ("fitting the CAD", 1.0),
+    ("components", 12.0),
+    ("datums", 2.0),
+    ("uncertainty", 1.0),
     ("depth maps", 32.0),
     ("polishing", 9.0),
     ("fusion", 4.0),
-    ("components", 19.0),
     ("cloud", 9.0),
-    ("datums", 2.0),
-    ("uncertainty", 1.0),
     ("distance map", 3.0),
     ("halves", 12.0),
     ("pictures", 4.0),
@@ -61,7 +61,7 @@ class ProgressEstimator:
 
     Args:
         show: called with each estimate.
-        has_video_frames, has_film, has_pdf: whether these steps belong to the run.
+        has_video_frames, has_film, has_pdf, has_cloud: whether these steps belong to the run.
         now: clock, seconds.
     """
 
@@ -71,9 +71,11 @@ class ProgressEstimator:
         has_video_frames: bool = True,
         has_film: bool = True,
         has_pdf: bool = True,
+        has_cloud: bool = True,
         now: Callable[[], float] = time.monotonic,
     ) -> None:
         left_out = {"frames": not has_video_frames, "film": not has_film, "PDF": not has_pdf}
+        left_out |= dict.fromkeys(("depth maps", "polishing", "fusion", "cloud", "distance map"), not has_cloud)
         self._steps = [(name, cost) for name, cost in STEPS if not left_out.get(name, False)]
         self._show, self._now = show, now
         self._began = now()

@@ -18,6 +18,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from arview import measurement, reconstruction
 from arview.core.checks import PATH, check_type
@@ -93,7 +94,12 @@ class Outcome:
 
 
 def inspect_part(
-    job: InspectJob, folder: str | Path, *, progress: Progress | None = None, starts_over: bool = False
+    job: InspectJob,
+    folder: str | Path,
+    *,
+    progress: Progress | None = None,
+    starts_over: bool = False,
+    on_verdict: Callable[[Inspection], None] | None = None,
 ) -> Outcome:
     """Inspect one part; stages that an earlier run finished in ``folder`` with the same inputs are skipped.
 
@@ -102,6 +108,8 @@ def inspect_part(
         folder: folder of all results; created if needed.
         progress: called with (step, done, total), see `arview.workflow.progress`.
         starts_over: ignore the results of earlier runs.
+        on_verdict: called with the measurement in the photos, before the dense cloud and the comparison of halves,
+            which may still add to it; not where the part is found in the cloud only.
 
     Raises:
         CannotMeasureError: the photos do not fit together, do not show the part, or contradict its CAD.
@@ -112,7 +120,8 @@ def inspect_part(
     """
     check_type(job, InspectJob, "inspect_part: job")
     check_type(folder, PATH, "inspect_part: folder")
-    return inspect_prepared(prepare(job, Path(folder)), Path(folder), progress=progress, starts_over=starts_over)
+    prepared, where = prepare(job, Path(folder)), Path(folder)
+    return inspect_prepared(prepared, where, progress=progress, starts_over=starts_over, on_verdict=on_verdict)
 
 
 def inspect_prepared(
@@ -133,8 +142,7 @@ def inspect_prepared(
         progress: see `inspect_part`.
         starts_over: see `inspect_part`.
         memory: features and matches that were found while the photos came.
-        on_verdict: called with the measurement in the photos, which is then made and written before the dense cloud;
-            the cloud and the comparison of halves may still add to it.
+        on_verdict: see `inspect_part`; the measurement in the photos is written before.
         is_settled: the folder's verdict stands: nothing is measured anew by other inputs than it was made from.
 
     Raises:
@@ -156,6 +164,10 @@ class _InspectionRun:
         self.stages = Stages(folder)
         self.records: list[StageRecord] = []
         self.warnings: list[str] = []
+        self.seconds: dict[str, float] = {}
+        self.verdict: list[StageRecord] = []
+        self.in_photos: dict[str, Any] = {}
+        self._last_stage = prepared.reconstruct.last_stage
 
     def execute(
         self, starts_over: bool, on_verdict: Callable[[Inspection], None] | None = None, is_settled: bool = False
@@ -171,10 +183,10 @@ class _InspectionRun:
             self._set_aside()
             self.stages.restart("inputs")
         self.stages.finish("inputs", key)
-        if on_verdict is not None:
-            on_verdict(self._measure_in_photos(key, starts_over))
-            starts_over = False
-        found = self._reconstruct(starts_over)
+        first = self._measure_in_photos(key, starts_over)
+        if first is not None and on_verdict is not None:
+            on_verdict(first)
+        found = self._reconstruct()
         self.stages = Stages(self.folder)  # the reconstruction has changed its file
         inspection = self._measure(key)
         self._report()
@@ -183,10 +195,13 @@ class _InspectionRun:
             self.folder,
             inspection,
             tuple(self.records),
-            tuple(path for path in (self.folder / name for name in (*RESULTS, "cloud.ply")) if path.is_file()),
+            tuple(path for path in (self.folder / name for name in self._files()) if path.is_file()),
             tuple(dict.fromkeys([*self.warnings, *inspection.warnings])),
             _peak_memory_mb(),
         )
+
+    def _files(self) -> tuple[str, ...]:
+        return (*RESULTS, "cloud.ply") if self.prepared.job.makes_cloud else RESULTS[:-1]
 
     def _set_aside(self) -> None:
         """Move results of other inputs to ``earlier/NN``, so that the folder never mixes results and loses none."""
@@ -203,46 +218,56 @@ class _InspectionRun:
         except OSError as error:
             raise OutputError(f"{aside}: cannot be written to ({error.strerror or error})") from error
 
-    def _reconstruct(self, starts_over: bool) -> reconstruction.Reconstruction:
-        prepared, job = self.prepared, self.prepared.job
-        options = replace(prepared.reconstruct, starts_over=starts_over)
+    def _reconstruct(self) -> reconstruction.Reconstruction:
+        """All stages of the reconstruction; those before the cloud were done before, unless the measurement is kept."""
+        found = self._reconstructed(self.prepared.reconstruct)
+        for name, title in _RECONSTRUCTION.items():
+            self.records += self.verdict if name == "dense" else []
+            if name == "dense" and not self.prepared.job.makes_cloud:
+                continue
+            seconds = max(self.seconds.get(name, 0.0), found.seconds.get(name, 0.0))
+            state = "done" if name in self.seconds or name in found.seconds else "kept"
+            self.records.append(StageRecord(title, state, seconds, _about(found, name)))
+        self.warnings += found.intake.warnings
+        self.warnings += found.coverage.advice if found.coverage is not None else ()
+        return found
+
+    def _reconstructed(self, options: reconstruction.ReconstructOptions) -> reconstruction.Reconstruction:
+        job = self.prepared.job
         with _measuring():
-            found = reconstruction.reconstruct(
+            return reconstruction.reconstruct(
                 job.photo_source,
                 self.folder,
-                prepared.part,
+                self.prepared.part,
                 job.camera,
                 options,
                 progress=self.progress,
                 memory=self.memory,
             )
-        for name, title in _RECONSTRUCTION.items():
-            state = "done" if name in found.seconds else "kept"
-            self.records.append(StageRecord(title, state, found.seconds.get(name, 0.0), _about(found, name)))
-        self.warnings += found.intake.warnings
-        self.warnings += found.coverage.advice if found.coverage is not None else ()
-        return found
 
-    def _measure_in_photos(self, inputs: str, starts_over: bool) -> Inspection:
-        """The measurement without what follows from the dense cloud and from halves of the photos."""
-        prepared, job, path = self.prepared, self.prepared.job, self.folder / "inspection.json"
-        options = replace(prepared.reconstruct, starts_over=starts_over, last_stage="scale")
+    def _measure_in_photos(self, inputs: str, starts_over: bool) -> Inspection | None:
+        """The measurement without what follows from the dense cloud and from halves of the photos.
+
+        None where the photos alone do not give it, but the cloud may.
+        """
+        prepared, path = self.prepared, self.folder / "inspection.json"
         if self.stages.key("measure") is None or starts_over:
-            with _measuring():
-                found = reconstruction.reconstruct(
-                    job.photo_source,
-                    self.folder,
-                    prepared.part,
-                    job.camera,
-                    options,
-                    progress=self.progress,
-                    memory=self.memory,
-                )
+            found = self._reconstructed(replace(prepared.reconstruct, starts_over=starts_over, last_stage="scale"))
+            self.seconds = found.seconds
             self.stages = Stages(self.folder)
             key = key_of(inputs, self.stages.key("scale"))
             if not self.stages.is_finished("verdict", key) or not path.is_file():
-                save_inspection(measured_in_photos(found, prepared, self.progress), path)
+                began = time.perf_counter()
+                try:
+                    inspection = measured_in_photos(found, prepared, self.progress, self.in_photos)
+                except CannotMeasureError:
+                    if not prepared.job.makes_cloud:
+                        raise
+                    return None
+                save_inspection(inspection, path)
                 self.stages.finish("verdict", key)
+                said = verdict_sentence(inspection)
+                self.verdict = [StageRecord("verdict by photos", "done", time.perf_counter() - began, said)]
         return load_inspection(path, prepared.part.model)
 
     def _measure(self, inputs: str) -> Inspection:
@@ -251,14 +276,16 @@ class _InspectionRun:
         def work() -> str:
 
             with _measuring():
-                found = measurement.read_folder(self.folder)
-                inspection = measurement.measure(found, part, self.prepared.measure, progress=self.progress)
+                found = measurement.read_folder(self.folder, with_cloud=self.prepared.job.makes_cloud)
+                inspection = measurement.measure(
+                    found, part, self.prepared.measure, progress=self.progress, known=self.in_photos
+                )
             if self.prepared.job.compares_halves:
                 inspection = with_halves(inspection, found, self.folder, self.prepared, self.progress)
             save_inspection(inspection, path)
             return ""
 
-        self._once("measure", "measurement", key_of(inputs, self.stages.key("dense")), [path], work)
+        self._once("measure", "measurement", key_of(inputs, self.stages.key(self._last_stage)), [path], work)
         inspection = load_inspection(path, part.model)
         self.records[-1] = replace(self.records[-1], note=verdict_sentence(inspection))
         return inspection
@@ -278,7 +305,7 @@ class _InspectionRun:
             self.warnings += evidence.absent.values()
             return "HTML and PDF" if pdf.is_file() else "HTML"
 
-        key = key_of(content_key([source]), self.stages.key("dense"), part.model.source_hash, __version__)
+        key = key_of(content_key([source]), self.stages.key(self._last_stage), part.model.source_hash, __version__)
         if not wants_pdf:
             pdf.unlink(missing_ok=True)
         self._once("report", "report", key, [html, pdf] if wants_pdf else [html], work)
@@ -336,8 +363,13 @@ class _InspectionRun:
         self.records.append(StageRecord(title, "done", time.perf_counter() - began, note))
 
 
-def measured_in_photos(found: reconstruction.Reconstruction, prepared: Prepared, progress: Progress) -> Inspection:
-    """The measurement of a reconstruction by sweep and edges, without a cloud.
+def measured_in_photos(
+    found: reconstruction.Reconstruction,
+    prepared: Prepared,
+    progress: Progress,
+    known: dict[str, Any] | None = None,
+) -> Inspection:
+    """The measurement of a reconstruction by sweep and edges, without a cloud; for ``known`` see `measurement.measure`.
 
     Raises:
         CannotMeasureError: the reconstruction has no frame, contradicts the CAD, or does not show the datums.
@@ -349,7 +381,7 @@ def measured_in_photos(found: reconstruction.Reconstruction, prepared: Prepared,
             metric = measurement.read_folder(found.folder, with_cloud=False)  # which says what is missing
         else:
             metric = measurement.MetricReconstruction(found.sparse, found.scale, None)
-        return measurement.measure(metric, prepared.part, options, progress=progress)
+        return measurement.measure(metric, prepared.part, options, progress=progress, known=known)
 
 
 @contextmanager

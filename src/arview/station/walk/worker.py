@@ -188,6 +188,8 @@ class WalkWorker:
                 raise
             self._say(cloud="failed", step="", text=f"{verdict_sentence(first[0])}; the cloud failed: {error}")
             return
+        if not first:  # the cloud alone gave it
+            on_verdict(outcome.inspection)
         self._say_cloud(first[0], outcome)
         self._add_to_history()
 
