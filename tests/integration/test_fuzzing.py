@@ -13,7 +13,7 @@ from helpers.paths import TESTS
 
 FUZZ = TESTS.parent / "tools" / "benchmarks" / "fuzz"
 TARGETS = (
-    "cad", "camera", "cloud", "commands", "exports", "given", "guideviews", "http", "inspection", "jobs", "learned",
+    "cad", "camera", "cloud", "commands", "exports", "given", "guideviews", "http", "inspection", "jobs",
     "lengths", "part", "picture", "poses", "positions", "rig", "scale", "step", "step_text", "studio", "video",
 )  # fmt: skip
 

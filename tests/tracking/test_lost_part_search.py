@@ -13,7 +13,7 @@ from arview.pose import TrackingState
 from arview.tracking import SessionOptions, SpecimenTracking
 from helpers.synthetic import CAMERA, assembly, assembly_views, error, path, picture
 
-OPTIONS = SessionOptions(use_appearance_memory=False)
+OPTIONS = SessionOptions()
 
 
 class RecordingDetector:

@@ -51,7 +51,6 @@ class _Outputs(NamedTuple):
 
     video: Path | None
     poses: Path | None
-    learned: Path | None
 
 
 def _parse_moment(ctx: click.Context, parameter: click.Parameter, value: str | None) -> int | float | None:
@@ -121,7 +120,6 @@ Examples:
 @click.option("-o", "--output", metavar="OUT.mp4", help="Annotated video.")
 @click.option("--poses", "poses_path", metavar="OUT.jsonl", help="Pose of every frame.")
 @click.option("--init", metavar="WHERE", help="POSE.json, or guide:NAME to align with.")
-@click.option("--learned", "learned_path", metavar="FILE", help="Learned views, read and written.")
 @click.option(
     "--serial-at",
     expose_value=False,
@@ -175,7 +173,6 @@ def annotate(
     output: str | None,
     poses_path: str | None,
     init: str | None,
-    learned_path: str | None,
     start: int | float | None,
     end: int | float | None,
     stride: int,
@@ -200,13 +197,13 @@ def annotate(
         say(f"no -o or --poses given: writing {output}")
     specimens = workflow.load_specimens(part_paths, instances, inspection_paths, unit)
     if len(specimens) > 1:
-        refuse_for_several({"--init": init, "--learned": learned_path, "--guideviews": views_path})
+        refuse_for_several({"--init": init, "--guideviews": views_path})
     guide_name = init.removeprefix(tracking.GUIDE_PREFIX) if init and init.startswith(tracking.GUIDE_PREFIX) else None
     init_path = init if guide_name is None else None
     first_pose = load_pose(init_path) if init_path else None
     files = [path for one in specimens for path in (one.part.path, one.part.cad_path)]
     inputs = source, *files, views_path, camera_spec, *inspection_paths, init_path
-    outputs = _check_outputs(output, poses_path, learned_path, inputs)
+    outputs = _check_outputs(output, poses_path, inputs)
     drawing = _drawing_options(show_edges, no_ghost, no_labels, opacity)
     wanted = [moment if isinstance(moment, int) else None for moment in (start, end)]
     is_guessed = camera_spec is None
@@ -215,7 +212,6 @@ def annotate(
         tracked = _tracked_parts(specimens, camera, views_path, renderer, guide_name, first_pose)
         keep = partial(report_estimate, profile=profile, source=source, turns=frames.quarter_turns_clockwise)
         session = start_session(tracked, frames, camera, session_options(modalities), keep if is_guessed else None)
-        _load_learned(session, outputs.learned)
         sink, overlay = None, None
         if outputs.video is not None:
             sink = open_sink(outputs.video, frames)
@@ -239,7 +235,6 @@ def annotate(
         *map("note: {}".format, frames.notes),
     ]
     _print_summary(summary, outputs, notes, session.camera_of(0) if is_guessed else None)
-    _save_learned(session, outputs.learned)
     _exit_if_interrupted(ctx, summary)
     ctx.exit(presence_exit_code(summary) if check_presence else finding_exit_code(summary))
 
@@ -265,9 +260,7 @@ def _drawing_options(
     )
 
 
-def _check_outputs(
-    video: str | None, poses: str | None, learned: str | None, inputs: Sequence[str | Path | None]
-) -> _Outputs:
+def _check_outputs(video: str | None, poses: str | None, inputs: Sequence[str | Path | None]) -> _Outputs:
     """The paths of the outputs, none of which overwrites an input or another output, or is being written."""
     for path in (video, poses):
         if path and (writer := writing_process(Path(path))) is not None:
@@ -278,7 +271,6 @@ def _check_outputs(
     return _Outputs(
         output_path(video, [*inputs]) if video else None,
         output_path(poses, [*inputs, video]) if poses else None,
-        output_path(learned, [*inputs, video, poses]) if learned else None,
     )
 
 
@@ -330,18 +322,6 @@ def _tracked_parts(
             )
         )
     return tracked
-
-
-def _load_learned(session: tracking.TrackingSession, path: Path | None) -> None:
-    if path is not None and path.exists():
-        session.specimens[0].search.memory.load(path)
-
-
-def _save_learned(session: tracking.TrackingSession, path: Path | None) -> None:
-    if path is not None:
-        memory = session.specimens[0].search.memory
-        memory.save(path)
-        click.echo(f"wrote {path}: {len(memory)} learned views")
 
 
 def _print_summary(summary: AnnotateSummary, outputs: _Outputs, notes: Sequence[str], guessed: Camera | None) -> None:

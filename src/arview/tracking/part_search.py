@@ -24,7 +24,6 @@ from arview.geometry import Array, apply, are_near, check_rigid
 from arview.guideviews import GuideViewSet
 from arview.pose import TrackingState
 from arview.refinement import PartView
-from arview.tracking.appearance_memory import AppearanceMemory
 from arview.tracking.base_detection import BaseDetection
 from arview.tracking.diagnosis import NOTHING_IN_VIEW, diagnose_picture, diagnose_search
 from arview.tracking.search.guided_init import GuidedInit, GuidedPose
@@ -41,9 +40,6 @@ USE_BASE_DETECTION = True
 LOCK_QUALITY = 0.8
 """A detection of this quality is accepted at once; a weaker one must be confirmed by a second frame. Near a given
 initial pose ``TRACKED_QUALITY`` is enough."""
-MIN_RESTING_SCORE = 0.7
-"""Correlation with the remembered appearance from which a place is examined in frames between two searches of the whole
-picture."""
 ALIGN_AGAIN_FRAMES = 60
 """Frames after a loss from which the part may be aligned with the guide view again."""
 ALIGN_ADVICE_EVERY = 10
@@ -93,7 +89,6 @@ class PartSearch:
 
     Attributes:
         local: the local search of the detector.
-        memory: how the part looked while it was tracked.
         others: poses (4,4) of other specimens of the part, which are not taken for this one.
         covers: where other parts are, at which this one is searched for in every second round of searches only.
         prior: (4,4) pose in this frame that is known from elsewhere, near which the part is searched for first.
@@ -121,7 +116,6 @@ class PartSearch:
         )
         self._guided_init: GuidedInit | None = None
         self._plan = SearchPlan(views, camera)
-        self.memory = AppearanceMemory(views, camera)
         self._initial = None if initial_cam_from_model is None else check_rigid(initial_cam_from_model, "initial pose")
         self._guide = None if guide_cam_from_model is None else check_rigid(guide_cam_from_model, "guide pose")
         self.others: tuple[Array, ...] = ()
@@ -287,24 +281,14 @@ class PartSearch:
             state.reason = diagnose_picture(image) or ALIGN
 
     def _detect(self, image: NDArray[np.uint8], state: SessionState, searches: list[int] | None) -> list[Detection]:
-        """Detect the part, with the remembered appearance as a hint; without searches only where that is seen."""
-        is_used, last = self._options.use_appearance_memory, state.last_sure_pose
-        guesses: list[Array] = []
+        """Detect the part, shortly after a loss where it was last; nothing without searches."""
         if searches == []:
-            if is_used and last is not None:
-                guesses = self._remembered(image, last, MIN_RESTING_SCORE)
-            return self.detector.detect_near(image, guesses) if guesses else []
+            return []
         if self._options.finder is not None:
             return list(self._options.finder.detect(image))
-        if is_used:
-            if last is not None and state.frames_without_pose <= EAGER_FRAMES:
-                guesses = self._remembered(image, last)
-            guesses = guesses or self._remembered(image)
+        last = state.last_sure_pose if state.frames_without_pose <= EAGER_FRAMES else None
+        guesses = [] if last is None else [last]
         return self.detector.detect(image, max_results=1, guesses=guesses, searches=searches)
-
-    def _remembered(self, image: NDArray[np.uint8], near: Array | None = None, min_score: float = 0.0) -> list[Array]:
-        """Rough poses (4,4) where the picture looks like a remembered view, best first."""
-        return [match.cam_from_model for match in self.memory.propose(image, near) if match.score >= min_score]
 
     def _turned(
         self, image: NDArray[np.uint8], found: Detection, components: AssemblyMonitor, frames_lost: int | None

@@ -37,7 +37,6 @@ class SessionOptions:
         use_edge: let the tracker use grey-level edges.
         use_texture: let the tracker use the part's own texture.
         use_recheck: run the detector's local search where a tracked pose is far from the predicted one.
-        use_appearance_memory: remember how the part looks while it is tracked, and look for that after a loss.
         detector: options of the detector; None chooses them by the declared range.
         finder: asked for the part in place of the detector; what it finds is refined and judged as usual.
         matcher: asked in each frame of a tracked part for points of it, which support the pose as its texture does.
@@ -47,7 +46,6 @@ class SessionOptions:
     use_edge: bool = True
     use_texture: bool = True
     use_recheck: bool = True
-    use_appearance_memory: bool = True
     detector: DetectorOptions | None = None
     finder: Finder | None = None
     matcher: Matcher | None = None

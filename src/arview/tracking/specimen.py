@@ -2,8 +2,8 @@
 
 The part is ``searching`` until first found, ``tracked`` while the picture supports its pose, ``critical`` while the
 support is weak, and ``lost`` when there is none. Every frame follows the last pose or examines what the search
-proposes; a pose is then disambiguated, its components are checked, and the part's appearance is remembered. The
-transitions between the states are a table, see `session_state`.
+proposes; a pose is then disambiguated, its components are checked. The transitions between the
+states are a table, see `session_state`.
 """
 
 from __future__ import annotations
@@ -203,7 +203,7 @@ class SpecimenTracking:
         if estimate is not None:
             estimate, reason = self._disambiguate(image, estimate, reason)
             reason = self._check_components(image, estimate, reason)
-            self._remember(image, estimate)
+            self._remember(estimate)
         known = self.identity.update(image, estimate, index, time_s, others, self._state.is_confirmed)
         if known.cam_from_model is not None and estimate is not None:
             estimate = self._restart(image, known.cam_from_model)
@@ -454,12 +454,9 @@ class SpecimenTracking:
         s.apply(Event.CONTRADICTED)
         return joined(reasons)
 
-    def _remember(self, image: NDArray[np.uint8], estimate: Estimate) -> None:
-        """Remember pose and appearance of a part that is tracked without doubt."""
-        is_sure = self.state == TrackingState.TRACKED and self._state.is_confirmed
-        if self.options.use_appearance_memory:
-            self.search.memory.learn(image, estimate, is_sure)
-        if is_sure:
+    def _remember(self, estimate: Estimate) -> None:
+        """Remember the pose of a part that is tracked without doubt."""
+        if self.state == TrackingState.TRACKED and self._state.is_confirmed:
             self._state.last_sure_pose = estimate.cam_from_model
 
 

@@ -30,9 +30,7 @@ from arview.refinement import (
     RefinementPyramid,
     TextureModality,
     apply_twist,
-    median_brightness_ratio,
     relative_twist,
-    value_bins,
 )
 from arview.tracking.covariance import POINTS_BETWEEN_FRAMES, POINTS_OF_FRAME, common_covariance, covariance_of
 from arview.tracking.estimate import Estimate
@@ -97,12 +95,6 @@ MIN_KEYFRAME_SUPPORT = 0.85
 part."""
 SUPPORT_DECAY = 0.99
 """Factor by which the best recent support of the outline decreases in each frame."""
-EXPOSURE_GRID_PX = 16
-"""Distance of the pixels from which a change of exposure is measured."""
-EXPOSURE_DECAY = 0.9
-"""Exponent by which the estimated exposure fades, because the histograms follow slow changes."""
-EXPOSURE_LIMITS = (0.2, 5.0)
-"""Smallest and largest exposure relative to the first frame."""
 SPREAD_RATE = 0.5
 """Share by which the estimated blur of the edges follows each look."""
 VELOCITY_DECAY = 0.9
@@ -389,7 +381,7 @@ class Tracker:
         state = self.state
         predicted = apply_twist(state.cam_from_body, state.velocity)
         frame = FrameContext(image, self._levels(image, [state.cam_from_body, predicted]), predicted, predicted)
-        self._follow_exposure(frame.levels.gray)
+        state.follow_exposure(frame.levels.gray)
         if self._texture is not None:
             frame.pyramid = self._texture.pyramid(frame.levels.gray)
             matches = self._texture.measure(frame.pyramid, predicted)
@@ -439,21 +431,6 @@ class Tracker:
         state = self.state
         if self.refiner.part.is_smooth and self.options.use_edge and self.options.use_region:
             state.uses_edges = state.edge_support >= (MIN_EDGE_SUPPORT if state.uses_edges else NEW_EDGE_SUPPORT)
-
-    def _follow_exposure(self, gray: NDArray[np.uint8]) -> None:
-        """Compensate the colours for a change of exposure since the last frame.
-
-        The change is the median ratio of the grey levels (H,W) on a coarse grid.
-        """
-        state = self.state
-        step = EXPOSURE_GRID_PX
-        if state.sparse_gray is None:
-            state.sparse_gray = np.zeros((gray.shape[0] // step, gray.shape[1] // step))
-        ratio = median_brightness_ratio(gray, state.sparse_gray, step)
-        if ratio != 1.0 or state.exposure != 1.0:
-            low, high = EXPOSURE_LIMITS
-            state.exposure = min(max(state.exposure**EXPOSURE_DECAY * ratio, low), high)
-            state.appearance.bin_of = value_bins(state.exposure)
 
     def _levels(self, image: NDArray[np.uint8], poses: list[Array]) -> RefinementPyramid:
         """The frame at the scales of the last of some poses (4,4), around the part at all of them."""

@@ -9,8 +9,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arview.geometry import Array
-from arview.refinement import Appearance, PoseEvidence, PoseScores, Pyramid, RefinementPyramid, Stage, TextureMatches
+from arview.refinement import (
+    Appearance,
+    PoseEvidence,
+    PoseScores,
+    Pyramid,
+    RefinementPyramid,
+    Stage,
+    TextureMatches,
+    median_brightness_ratio,
+    value_bins,
+)
 from arview.tracking.motion import MotionModel
+
+EXPOSURE_GRID_PX = 16
+"""Distance of the pixels from which a change of exposure is measured."""
+EXPOSURE_DECAY = 0.9
+"""Exponent by which the estimated exposure fades, because the histograms follow slow changes."""
+EXPOSURE_LIMITS = (0.2, 5.0)
+"""Smallest and largest exposure relative to the first frame."""
 
 
 @dataclass
@@ -52,6 +69,20 @@ class TrackerState:
     spread_px: float = 0.0
     motion: MotionModel = field(default_factory=MotionModel)
     unknown_twist: Array | None = None
+
+    def follow_exposure(self, gray: NDArray[np.uint8]) -> None:
+        """Compensate the colours for a change of exposure since the last frame.
+
+        The change is the median ratio of the grey levels (H,W) on a coarse grid.
+        """
+        step = EXPOSURE_GRID_PX
+        if self.sparse_gray is None:
+            self.sparse_gray = np.zeros((gray.shape[0] // step, gray.shape[1] // step))
+        ratio = median_brightness_ratio(gray, self.sparse_gray, step)
+        if ratio != 1.0 or self.exposure != 1.0:
+            low, high = EXPOSURE_LIMITS
+            self.exposure = min(max(self.exposure**EXPOSURE_DECAY * ratio, low), high)
+            self.appearance.bin_of = value_bins(self.exposure)
 
     def is_futile(self, score: float, frames: int, share: float) -> bool:
         """Whether no other schedule gained anything a few frames ago, and the score is hardly lower now."""

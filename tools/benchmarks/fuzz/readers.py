@@ -30,7 +30,6 @@ from arview.quality.batch.jobs_file import load_jobs
 from arview.reconstruction.given_poses import read_poses
 from arview.reconstruction.intake.reading import glance, read_photo
 from arview.reconstruction.scale.specs import load_rig, load_scale_file
-from arview.tracking.appearance_file import load_views
 from arview.video import open_source
 from helpers.paths import SHARED, TESTS
 
@@ -205,11 +204,6 @@ def _qif_schema() -> Any:
     return etree.XMLSchema(etree.parse(published if published.is_file() else TESTS / "inspection" / "qif3_subset.xsd"))
 
 
-def read_learned(path: Path, seeds: Path) -> None:
-    """Learned views, of the seed's guide views."""
-    load_views(path, load_guide_views(seeds / "brick.guideviews.npz"))
-
-
 def read_guide_views(path: Path, seeds: Path) -> None:
     """Guide views, each of which is decoded."""
     for view in load_guide_views(path):
@@ -229,7 +223,6 @@ READERS: dict[str, Callable[[Path, Path], Any]] = {
     "positions": read_positions,
     "part": read_part,
     "lengths": read_lengths,
-    "learned": read_learned,
     "guideviews": read_guide_views,
     "scale": lambda path, _: load_scale_file(path),
     "rig": lambda path, _: load_rig(path),

@@ -10,9 +10,7 @@ import cv2
 import numpy as np
 
 from arview.cad import load_part
-from arview.guideviews import GuideViewOptions, load_guide_views, make_guide_views
-from arview.tracking.appearance_file import SavedViews, save_views
-from arview.tracking.search.view_crops import CHANNELS, CROP_PX
+from arview.guideviews import GuideViewOptions, make_guide_views
 from helpers.cad_files import StepBodies, StepWriter, box, nested_3mf, nested_glb, nested_step, obj_text
 from helpers.video_files import numbered, write_clip
 
@@ -222,17 +220,6 @@ def _guide_views(folder: Path) -> list[Path]:
     return [folder / "brick.guideviews.npz"]
 
 
-def _learned(folder: Path) -> list[Path]:
-    views = load_guide_views(_guide_views(folder)[0])
-    saved = SavedViews(
-        np.stack([np.eye(3)] * 2),
-        np.zeros((2, CROP_PX, CROP_PX, CHANNELS), np.uint8),
-        np.zeros((2, CROP_PX, CROP_PX), np.uint8),
-    )
-    save_views(folder / "brick.learned.npz", saved, views)
-    return [folder / "brick.learned.npz"]
-
-
 _MAKERS: dict[str, Callable[[Path], list[Path]]] = {
     "cad": _cad,
     "step": _step,
@@ -251,7 +238,6 @@ _MAKERS: dict[str, Callable[[Path], list[Path]]] = {
     "inspection": lambda folder: [SAMPLE / "inspection.json"],
     "exports": lambda folder: [SAMPLE / "inspection.json"],
     "guideviews": _guide_views,
-    "learned": _learned,
 }
 
 

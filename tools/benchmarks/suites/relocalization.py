@@ -1,4 +1,4 @@
-"""Relocalization after a loss on the recorded sequences, with and without learned views."""
+"""Relocalization after a loss on the recorded sequences."""
 
 from __future__ import annotations
 
@@ -27,14 +27,12 @@ class Relocalized:
         losses: number of losses.
         found, wrong: of them, those that the next frame ended with a right and with a wrong pose.
         cpu_ms: CPU time of each of these frames.
-        views: learned views at the end.
     """
 
     losses: int
     found: int
     wrong: int
     cpu_ms: tuple[float, ...]
-    views: int
 
     @property
     def median_ms(self) -> float:
@@ -50,18 +48,14 @@ def relocalization_rows(found: dict[str, Scene], details: dict[str, Any], losses
     """A row for each sequence."""
     rows = []
     for name, scene in watched(found.items(), "relocalization"):
-        without, learned = (lose_and_find(name, scene, use, losses or LOSSES) for use in (False, True))
-        details.setdefault("relocalization", {})[name] = {"without": asdict(without), "learned": asdict(learned)}
-        text = f"{learned.format()}; without {without.format()}"
-        reached = learned.wrong == 0 and learned.found >= without.found and learned.median_ms < without.median_ms
-        target = "0 wrong; with learned views no fewer, sooner"
-        rows.append(
-            ResultRow("found in the frame after a loss", f"{name}, {learned.views} views", text, target, reached)
-        )
+        one = lose_and_find(name, scene, losses or LOSSES)
+        details.setdefault("relocalization", {})[name] = asdict(one)
+        reached = one.wrong == 0 and one.found == one.losses
+        rows.append(ResultRow("found in the frame after a loss", name, one.format(), "all, 0 wrong", reached))
     return rows
 
 
-def lose_and_find(name: str, scene: Scene, use_appearance_memory: bool, losses: int) -> Relocalized:
+def lose_and_find(name: str, scene: Scene, losses: int) -> Relocalized:
     """Track the first half; in the second half, cover the camera before some frames until the part is lost.
 
     The guide views cover the full sphere. Where a frame does not find the part, the session continues from the truth.
@@ -73,7 +67,7 @@ def lose_and_find(name: str, scene: Scene, use_appearance_memory: bool, losses: 
         symmetries=box_symmetries(model) if name in BOXES else scene.part.symmetries,
         symmetric_poses=scene.symmetric_poses,
     )
-    options = SessionOptions(use_appearance_memory=use_appearance_memory)
+    options = SessionOptions()
     frames = [f for f in scene.frames if f.cam_from_model is not None]
     half = len(frames) // 2
     step = max(1, round((len(frames) - half) / losses))
@@ -100,8 +94,6 @@ def lose_and_find(name: str, scene: Scene, use_appearance_memory: bool, losses: 
         right += is_right
         wrong += pose.cam_from_model is not None and not is_right
         if not is_right:
-            kept = session.search.memory
             session = SpecimenTracking(views, scene.camera, model, options, initial_cam_from_model=frame.cam_from_model)
-            session.search.memory = kept
             session.process(image, frame.index, number / 30.0)
-    return Relocalized(count, right, wrong, tuple(cpu_ms), len(session.search.memory))
+    return Relocalized(count, right, wrong, tuple(cpu_ms))

@@ -25,7 +25,7 @@ from arview.refinement import ViewArrays, nearest_view
 MAX_OUTLINE_REACH = 1.4
 """Half diameters from the part's centre within which its outline lies in the image; near parts reach beyond 1."""
 
-WORTH_SHIFTING = 0.85
+PROMISING_SHARE = 0.85
 """Share of the best response so far that an outline must have where it is, to be tried with shifts, too."""
 
 
@@ -209,7 +209,7 @@ def outline_score(
             unshifted += np.int64(maps[buffer[2, i], row, column])
     count = points.shape[0]
     counted = count * (1.0 - TRIMMED_SHARE) if is_trimmed else 1.0 * count
-    if unshifted < WORTH_SHIFTING * best_so_far * 255.0 * counted:
+    if unshifted < PROMISING_SHARE * best_so_far * 255.0 * counted:
         return 0.0, 0, 0
     best, dx, dy = best_shift(maps, buffer, count, shift_px, shift_step, sums)
     total = 1.0 * (_trimmed_sum(maps, buffer, count, dx, dy, sectors) if is_trimmed else best)
