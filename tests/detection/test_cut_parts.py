@@ -109,7 +109,7 @@ def test_an_outline_cut_by_the_border_is_scored_by_its_points_inside(is_trimmed:
         work = np.empty((3, len(points)), np.int64), np.empty((1, 1), np.int32), np.empty(SECTORS, np.int64)
         return float(outline_score(
             maps, shown, angles, 0.0, RADIUS_PX, 0.0, PAD_PX + x, PAD_PX + 0.5 * SIDE_PX, 0, 2, is_trimmed, PAD_PX,
-            min_cut_px, floor, *work,
+            min_cut_px, floor, *work, 0.0,
         )[0])  # fmt: skip
 
     half = 2.0 / 3.0 if is_trimmed else 0.5  # the trimmed quarter is outside the picture

@@ -33,7 +33,7 @@ def score(hidden_deg: tuple[float, float], is_trimmed: bool) -> float:
     buffer = np.empty((3, len(points)), dtype=np.int64)
     sectors = np.empty(SECTORS, dtype=np.int64)
     found, dx, dy = outline_score(
-        maps, points, angles, 0.0, RADIUS_PX, 0.0, 63.5, 63.5, 0, 2, is_trimmed, 0, 0.0, 0.0, buffer, sums, sectors
+        maps, points, angles, 0.0, RADIUS_PX, 0.0, 63.5, 63.5, 0, 2, is_trimmed, 0, 0.0, 0.0, buffer, sums, sectors, 0.0
     )
     assert (dx, dy) == (0, 0)
     return float(found)

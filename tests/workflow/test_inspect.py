@@ -32,6 +32,8 @@ from helpers.inspections import deviation, inspection, not_measured
 from helpers.video_files import numbered, write_clip
 
 PART = '[part]\nname = "bench"\ncad = "bench.obj"\nunit = "mm"\n[components.plate]\nrole = "base"\n'
+ALL = ["reconstruct", "measure", "cloud", "measure"]
+"""The verdict by photos comes before the cloud."""
 
 
 class Bench:
@@ -49,7 +51,7 @@ class Bench:
             (folder / "photos" / f"{i}.jpg").write_bytes(bytes([i]) * 100)
         patch.setattr(arview.reconstruction, "reconstruct", self.reconstruct)
         patch.setattr(arview.measurement, "measure", self.measure)
-        patch.setattr(arview.measurement, "read_folder", lambda folder: None)
+        patch.setattr(arview.measurement, "read_folder", lambda folder, with_cloud=True: None)
         patch.setattr(arview.workflow.run, "with_halves", lambda found, *others: found)
         patch.setattr(arview.workflow.run, "make_film", self.film)
 
@@ -64,15 +66,20 @@ class Bench:
         stages = Stages(folder)
         key = content_key(sorted(Path(source).iterdir()) if Path(source).is_dir() else [Path(source)])
         seconds = {"photos": 0.1}
-        if not stages.is_finished("dense", key) or options.starts_over:
+        if not stages.is_finished("scale", key) or options.starts_over:
             self.at("reconstruct")
+            stages.restart("dense")
+            stages.finish("scale", key)
+            seconds |= {"sparse": 1.0, "scale": 0.5}
+        if options.last_stage == "dense" and not stages.is_finished("dense", key):
+            self.at("cloud")
             progress("fusion", 1, 1)
             stages.finish("dense", key)
-            seconds |= {"sparse": 1.0, "scale": 0.5, "dense": 2.0}
+            seconds |= {"dense": 2.0}
         intake = Intake((), (("3.jpg", "is blurred"),), ("the photos are few",), (), ())
         return Reconstruction(folder, intake, None, None, None, None, None, seconds)
 
-    def measure(self, reconstruction: Any, part: Any, options: Any, progress: Any) -> Inspection:
+    def measure(self, reconstruction: Any, part: Any, options: Any, progress: Any, known: Any) -> Inspection:
         self.at("measure")
         center = np.array([30.0, 27.5, 12.5])
         one = deviation("block", self.moved, center) if self.is_measured else not_measured("block", center)
@@ -169,7 +176,7 @@ def test_bad_input_is_said_before_the_work(bench: Bench, monkeypatch: pytest.Mon
 
 @pytest.mark.slow
 def test_what_is_finished_is_kept(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert bench.inspect().exit_code == 0 and bench.did == ["reconstruct", "measure"]
+    assert bench.inspect().exit_code == 0 and bench.did == ALL
     out = bench.folder / "out"
     before = {name: (out / name).read_bytes() for name in ("inspection.json", "report.html")}
     assert bench.inspect().exit_code == 0 and bench.did == []
@@ -183,8 +190,18 @@ def test_what_is_finished_is_kept(bench: Bench, monkeypatch: pytest.MonkeyPatch)
     assert bench.inspect().exit_code == 0 and bench.did == [] and (out / "report.html").is_file()
     (out / "inspection.json").write_text(before["inspection.json"].decode().replace('"pass"', '"fail"'))
     assert bench.inspect().exit_code == 0 and bench.did == ["measure"]
-    assert bench.inspect("--tolerance", "0.3").exit_code == 0 and bench.did == ["measure"]
-    assert bench.inspect("--tolerance", "0.3", "--force").exit_code == 0 and bench.did == ["reconstruct", "measure"]
+    assert bench.inspect("--tolerance", "0.3").exit_code == 0 and bench.did == ["measure", "measure"]
+    assert bench.inspect("--tolerance", "0.3", "--force").exit_code == 0 and bench.did == ALL
+
+
+@pytest.mark.slow
+def test_the_verdict_is_said_before_the_cloud_and_without_one(bench: Bench) -> None:
+    found = bench.inspect()
+    assert "by the photos: PASS; 1 component" in found.stderr
+    bench.fails["cloud"] = InputError("the cloud is empty")
+    assert bench.inspect("--force").exit_code == 3
+    assert bench.inspect("--no-cloud").exit_code == 0 and bench.did == ["measure", "measure"]
+    assert (bench.folder / "out" / "report.html").is_file()
 
 
 @pytest.mark.slow
@@ -200,7 +217,7 @@ def test_nothing_is_left_of_other_inputs(bench: Bench) -> None:
     bench.fails = {"measure": KeyboardInterrupt()}
     assert bench.inspect().exit_code == 130 and bench.did == ["reconstruct"]
     bench.fails.clear()
-    assert bench.inspect().exit_code == 0 and bench.did == ["measure"]
+    assert bench.inspect().exit_code == 0 and bench.did == ["measure", "cloud", "measure"]
 
 
 @pytest.mark.slow
@@ -208,19 +225,19 @@ def test_the_film_goes_with_the_measurement(bench: Bench) -> None:
     clip = write_clip(bench.folder / "clip.mp4", [numbered(index) for index in range(5)])
     photos = ["--photos", str(bench.folder / "photos")]
     found = bench.inspect(*photos, "--video", str(clip))
-    assert found.exit_code == 0 and bench.did == ["reconstruct", "measure", "film"]
+    assert found.exit_code == 0 and bench.did == [*ALL, "film"]
     assert "followed in 5 of 5" in found.stdout and "camera is guessed" in found.stderr
     film = bench.folder / "out" / "annotated.mp4"
     assert film.read_bytes() == b"film of 0.1"
     assert bench.inspect(*photos, "--video", str(clip)).exit_code == 0 and bench.did == []
     bench.moved = (0.2, 0.0, 0.0)
     assert bench.inspect(*photos, "--video", str(clip), "--tolerance", "3").exit_code == 0
-    assert bench.did == ["measure", "film"] and film.read_bytes() == b"film of 0.2"
+    assert bench.did == ["measure", "measure", "film"] and film.read_bytes() == b"film of 0.2"
     bench.fails["film"] = InputError("clip.mp4: damaged at 2 s")
     found = bench.inspect(*photos, "--video", str(clip), "--video-camera", "fov:60", "--tolerance", "3")
     assert found.exit_code == 0 and "no film: clip.mp4: damaged" in found.stderr and not film.exists()
     bench.fails.clear()
-    assert bench.inspect("--video", str(clip)).exit_code == 0 and bench.did == ["reconstruct", "measure", "film"]
+    assert bench.inspect("--video", str(clip)).exit_code == 0 and bench.did == [*ALL, "film"]
 
 
 def test_a_verdict_that_stands_is_not_made_anew_by_other_inputs(bench: Bench) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import TYPE_CHECKING
 
 import click
 
@@ -11,8 +12,10 @@ from arview import workflow
 from arview.cli.common import UNIT, main, say
 from arview.cli.exit_codes import ExitCode, exit_code_of
 from arview.core.progress import Progress, check_stop
-from arview.inspection import Inspection, overall_verdict, verdict_sentence
 from arview.quality import history
+
+if TYPE_CHECKING:
+    from arview.inspection import Inspection
 
 
 @main.command(
@@ -44,7 +47,7 @@ Examples:
 @click.option(
     "--scale-file",
     metavar="FILE",
-    help="TOML or JSON file of the boards, tags, tag layouts, scale bars and rig in view.",
+    help="File of the boards, tags, tag layouts, scale bars and rig in view.",
 )
 @click.option(
     "--masks",
@@ -162,6 +165,8 @@ def inspect(
 
 def say_verdict(inspection: Inspection) -> None:
     """Say the verdict by the photos, while cloud, report and film are still made."""
+    from arview.inspection import overall_verdict, verdict_sentence
+
     verdict = overall_verdict(inspection).value.replace("_", " ").upper()
     say(f"by the photos: {verdict}; {verdict_sentence(inspection)}")
 

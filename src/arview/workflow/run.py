@@ -181,7 +181,8 @@ class _InspectionRun:
                     "left as it is; measure the part again for a new one"
                 )
             self._set_aside()
-            self.stages.restart("inputs")
+            for stage in ("inputs", "measure"):
+                self.stages.restart(stage)
         self.stages.finish("inputs", key)
         first = self._measure_in_photos(key, starts_over)
         if first is not None and on_verdict is not None:
@@ -268,7 +269,10 @@ class _InspectionRun:
                 self.stages.finish("verdict", key)
                 said = verdict_sentence(inspection)
                 self.verdict = [StageRecord("verdict by photos", "done", time.perf_counter() - began, said)]
-        return load_inspection(path, prepared.part.model)
+        try:
+            return load_inspection(path, prepared.part.model)
+        except InputError:  # the file was removed or changed: it is made anew
+            return None
 
     def _measure(self, inputs: str) -> Inspection:
         part, path = self.prepared.part, self.folder / "inspection.json"

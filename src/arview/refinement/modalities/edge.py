@@ -27,6 +27,8 @@ COLOR_REACH_PX = 4
 """Pixels to either side of a step whose colours are compared."""
 COLOR_GAIN = 4.0
 """Logarithm by which a step with the same colours on both sides is weaker where another one separates them fully."""
+TWICE_AVERAGED = 0.85
+"""Scale up to which a picture is averaged twice."""
 SMOOTHED_SIGMA_PX = 0.82
 """Standard deviation of the average over three pixels in a row."""
 LEVEL_UNIT = 1 << 14
@@ -54,10 +56,11 @@ class EdgeProfiles(NamedTuple):
 def smoothed(gray: NDArray[np.uint8], scale: float = 1.0) -> NDArray[np.uint8]:
     """Grey picture (H,W), averaged over 3×3 pixels of a picture larger by a scale, the input of the edge modality.
 
-    From twice the size on interpolation smooths enough.
+    From twice the size on interpolation smooths enough. Averaged twice, it is as of a picture smaller by √½.
     """
     if scale <= 1.0:
-        return np.asarray(cv2.blur(gray, (3, 3)))
+        averaged = cv2.blur(gray, (3, 3))
+        return np.asarray(averaged if scale > TWICE_AVERAGED else cv2.blur(averaged, (3, 3)))
     return np.ascontiguousarray(gray if scale >= 2.0 else cv2.GaussianBlur(gray, (3, 3), SMOOTHED_SIGMA_PX / scale))
 
 

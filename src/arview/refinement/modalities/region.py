@@ -193,8 +193,7 @@ def measure_region(
                 # Beyond the run the line is on another surface.
                 if t < -run_in or t > run_out:
                     continue
-                x = int(u + t * nu + 0.5)
-                y = int(v + t * nv + 0.5)
+                x, y = int(u + t * nu + 0.5), int(v + t * nv + 0.5)
                 total += odds[bin_of[image[y, x, 0]] * 256 + bin_of[image[y, x, 1]] * 16 + bin_of[image[y, x, 2]]]
             # Probability of "part" minus that of "background", by a soft sign instead of tanh.
             total *= soften
