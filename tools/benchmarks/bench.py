@@ -23,16 +23,17 @@ from arview.errors import ArviewError
 from arview.guideviews import GuideViewOptions, load_guide_views, make_guide_views
 from arview.tracking import SessionOptions
 from arview_lab.evaluation import Scene, evaluate_scene, scene_guide_views
-from recordings import SAMPLE, sample_command, scenes, skip, table
+from recordings import ROOT, SAMPLE, sample_command, scenes, skip, table
+from rows import watched
 from suites.cloud_cost import cloud_costs
 from suites.lenses import lens_errors
 from suites.live_latency import live_latencies
 from suites.registration import MEASURED, REFERENCE, registrations
-from suites.scaling import component_cost, photo_cost
+from suites.scaling import GROWTHS, Cost, plot, slope
 
 TableRow = tuple[str, str, str]
 CLOUD_POINTS = (1_000_000, 20_000_000)
-PHOTOS, COMPONENTS = (24, 48, 96), (16, 60, 200)
+OUT = ROOT / "out"
 MODALITIES = {"region+edge": SessionOptions(use_texture=False), "all three": SessionOptions()}
 DETECTED_FRAMES = 12
 
@@ -176,17 +177,20 @@ def bench_clouds() -> tuple[dict[str, Any], list[TableRow]]:
 
 
 def bench_costs() -> tuple[dict[str, Any], list[TableRow]]:
-    """CPU time of each step and peak memory by the number of photos, and of components in a cloud."""
+    """CPU time of each step and peak memory by what grows, and the slope of their sum in a log-log plot."""
     figures: dict[str, Any] = {}
     rows: list[TableRow] = []
-    runs = [("photos", photo_cost, n, "placed") for n in PHOTOS]
-    runs += [("components in a cloud", component_cost, n, "within U") for n in COMPONENTS]
-    for what, run, count, result in runs:
-        cost = run(count)
-        figures[f"{count} {what}"] = asdict(cost)
-        steps = ", ".join(f"{name} {seconds:.1f}" for name, seconds in cost.seconds.items())
-        figure = f"{sum(cost.seconds.values()):.0f} CPU-s ({steps}), {cost.peak_mb:.0f} MB; {cost.good} {result}"
-        rows.append(("cost", f"{count} {what}", figure))
+    grown: dict[str, dict[int, Cost]] = {}
+    for what, (run, sizes, result) in GROWTHS.items():
+        costs = grown[what] = {size: run(size) for size in watched(sizes, what)}
+        for size, cost in costs.items():
+            figures[f"{size} {what}"] = asdict(cost)
+            steps = ", ".join(f"{name} {seconds:.2f}" for name, seconds in cost.seconds.items())
+            figure = f"{sum(cost.seconds.values()):.1f} CPU-s ({steps}), {cost.peak_mb:.0f} MB; {cost.good} {result}"
+            rows.append(("cost", f"{size:,} {what}", figure))
+        totals = [sum(cost.seconds.values()) for cost in costs.values()]
+        rows.append(("growth", what, f"slope {slope(sizes, totals):.2f}"))
+    plot(grown, OUT / "growth.svg")
     return figures, rows
 
 

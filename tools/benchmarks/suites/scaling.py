@@ -1,31 +1,40 @@
-"""Cost of each step by the number of photos and of components, in CPU time and memory, in a process of its own each."""
+"""Cost of each step by what grows, in CPU time and memory, in a process of its own each; see `GROWTHS`."""
 
 from __future__ import annotations
 
 import json
+import math
 import multiprocessing
 import resource
 import tempfile
 import time
 from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import cv2
 import numpy as np
+import trimesh
+from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from arview.cad import load_part
-from arview.cad.model import Component, make_model
+from arview.cad import ViewRange, load_part
+from arview.cad.model import Component, Model, make_model
 from arview.cad.part import ComponentSettings, Part
+from arview.camera import Camera
 from arview.camera.read import load_camera
-from arview.geometry import Array, apply, exp_so3
+from arview.detection import Detector
+from arview.geometry import Array, apply, exp_so3, rigid
+from arview.guideviews import GuideViewOptions, GuideViewSet, make_guide_views
 from arview.measurement.cloud.mesh_surface import MeshSurface
 from arview.measurement.folder import read_cloud, read_folder
 from arview.measurement.options import MeasureOptions
 from arview.measurement.run import measure
 from arview.reconstruction.run import ReconstructOptions, reconstruct
+from arview.rendering import ZBufferRenderer
+from arview.tracking import TrackedPart, TrackingSession
 from recordings import ROOT
 
 PLATE = ROOT / "samples" / "plate"
@@ -71,6 +80,56 @@ def photo_cost(count: int) -> Cost:
 def component_cost(count: int) -> Cost:
     """The measurement of ``count`` components on a plate in a cloud whose place is known."""
     return _alone(_in_cloud, count)
+
+
+def triangle_cost(count: int) -> Cost:
+    """Guide views, session and tracked frames of one lump of about ``count`` triangles."""
+    return _alone(_of_triangles, count)
+
+
+def picture_cost(kilopixels: int) -> Cost:
+    """Search and tracked frames of one part in pictures of a size, which it fills always by the same share."""
+    return _alone(_of_pictures, kilopixels)
+
+
+def part_cost(count: int) -> Cost:
+    """Tracked frames of ``count`` specimens of one part in one film."""
+    return _alone(_of_specimens, count)
+
+
+GROWTHS: dict[str, tuple[Callable[[int], Cost], tuple[int, ...], str]] = {
+    "photos": (photo_cost, (12, 24, 48, 96), "placed"),
+    "components in a cloud": (component_cost, (10, 30, 100, 300), "within U"),
+    "triangles": (triangle_cost, (20_480, 81_920, 327_680, 1_310_720), "frames tracked"),
+    "kilopixels": (picture_cost, (300, 900, 2_000, 8_000), "frames tracked"),
+    "specimens": (part_cost, (1, 2, 4, 8), "frames tracked"),
+}
+"""What grows: the cost of a size, the sizes, and what comes out."""
+
+
+def slope(sizes: Sequence[int], seconds: Sequence[float]) -> float:
+    """Slope of a line through the costs (N,) of sizes (N,), both as logarithms; NaN where a cost is not measurable."""
+    if min(seconds) <= 0.0:
+        return float("nan")
+    return float(np.polyfit(np.log(np.array(sizes, dtype=np.float64)), np.log(seconds), 1)[0])
+
+
+def plot(grown: Mapping[str, Mapping[int, Cost]], path: Path) -> None:
+    """A log-log plot of all that grew, each over its sizes, relative to its smallest one; SVG."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(8.0, 4.5), layout="constrained")
+    axes = figure.subplots()
+    for what, costs in grown.items():
+        sizes = sorted(costs)
+        totals = [sum(costs[size].seconds.values()) for size in sizes]
+        label = f"{what}: slope {slope(sizes, totals):.2f}"
+        axes.loglog(np.array(sizes) / sizes[0], np.array(totals) / totals[0], "o-", label=label)
+    axes.set(xlabel="size, relative to the smallest", ylabel="CPU time, relative to it")
+    axes.grid(True, which="both", alpha=0.3)
+    axes.legend()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path)
 
 
 def _alone(work: object, count: int) -> Cost:
@@ -152,6 +211,99 @@ def plate_with_posts(count: int) -> tuple[Part, dict[str, Array]]:
         moves[parts[-1].name] = np.array([*rng.uniform(-0.8, 0.8, 2), 0.0])
     settings = tuple(ComponentSettings(c.name, "inspect" if c.name in moves else "base") for c in parts)
     return Part("boxes", Path("boxes"), Path("boxes"), make_model("boxes", tuple(parts)), settings), moves
+
+
+FRAMES = 40
+"""Frames that are tracked, after the first, in which the part is found or its start is refined."""
+
+
+def _lump(triangles: int) -> Model:
+    """A closed lump without symmetries."""
+    steps = max(0, round(math.log(triangles / 20.0, 4.0)))
+    ball = trimesh.creation.icosphere(steps)
+    x, y, z = ball.vertices.T
+    bumps = 1.0 + 0.15 * np.sin(3.0 * x + 1.0) * np.cos(4.0 * y) + 0.1 * np.sin(5.0 * z + 2.0 * x)
+    vertices = ball.vertices * (60.0 * bumps)[:, None] * [1.0, 0.7, 0.5]
+    return make_model("lump", (Component("lump", vertices, ball.faces.astype(np.int32)),))
+
+
+def _views_of(model: Model) -> GuideViewSet:
+    views_range = ViewRange((2.0 * model.diameter_mm, 6.0 * model.diameter_mm))
+    return make_guide_views(model, views_range, GuideViewOptions(subdivisions=2, renderer="zbuffer"))
+
+
+def _drawn(model: Model, camera: Camera, poses: Sequence[Array], seed: int) -> NDArray[np.uint8]:
+    """A picture (H,W,3) of a model at some poses (4,4), grey on grey with noise."""
+    renderer = ZBufferRenderer(model, camera)
+    gray = np.full((camera.height, camera.width), 70, dtype=np.uint8)
+    for pose in poses:
+        rendering = renderer.render(pose)
+        shown = rendering.component_ids >= 0
+        gray[shown] = rendering.shaded(camera)[shown]
+    noise = np.random.default_rng(seed).normal(0.0, 2.0, gray.shape)
+    noisy = np.clip(gray + noise, 0.0, 255.0).astype(np.uint8)
+    return np.ascontiguousarray(np.repeat(noisy[..., None], 3, axis=2))
+
+
+def _path(model: Model, frame: int, aside_mm: float = 0.0) -> Array:
+    """Pose (4,4) of the part in a frame: it turns and sways."""
+    turn = exp_so3(np.array([0.6 + 0.004 * frame, 0.3 + 0.006 * frame, 0.1]))
+    place = np.array([aside_mm + 4.0 * np.sin(0.1 * frame), 2.0 * np.cos(0.1 * frame), 3.0 * model.diameter_mm])
+    return rigid(turn, place - turn @ model.center_in_model)
+
+
+def _camera(kilopixels: int) -> Camera:
+    width = round(math.sqrt(1000.0 * kilopixels * 4.0 / 3.0) / 8.0) * 8
+    height = width * 3 // 4
+    return Camera(width, height, 1.1 * width, 1.1 * width, 0.5 * width - 0.5, 0.5 * height - 0.5)
+
+
+def _tracked(views: GuideViewSet, model: Model, camera: Camera, asides_mm: Sequence[float], clock: StepClock) -> int:
+    """Track specimens through drawn frames; the number of frames in which all are followed."""
+    clock("session")
+    parts = [
+        TrackedPart(views, model, f"#{k}", initial_cam_from_model=_path(model, 0, aside))
+        for k, aside in enumerate(asides_mm)
+    ]
+    session = TrackingSession(parts, camera)
+    good = 0
+    for frame in range(FRAMES + 1):
+        clock("drawing")
+        image = _drawn(model, camera, [_path(model, frame, aside) for aside in asides_mm], frame)
+        clock("tracked frames" if frame else "first frame")
+        poses = session.process(image, frame, frame / 30.0)
+        good += frame > 0 and all(pose.cam_from_model is not None for pose in poses)
+    clock("end")
+    del clock.seconds["drawing"]
+    return good
+
+
+def _of_triangles(count: int) -> Cost:
+    model, camera, clock = _lump(count), _camera(300), StepClock()
+    clock("guide views")
+    views = _views_of(model)
+    return _cost(clock, _tracked(views, model, camera, [0.0], clock), FRAMES)
+
+
+def _of_pictures(kilopixels: int) -> Cost:
+    part, camera = load_part(PLATE / "part.toml"), _camera(kilopixels)
+    model, clock = part.model, StepClock()
+    views = _views_of(model)
+    detector, image = Detector(views, camera), _drawn(model, camera, [_path(model, 0)], 0)
+    detector.detect(image)  # compiled code is loaded
+    clock.last = time.process_time()
+    clock("search")
+    detector.detect(image)
+    return _cost(clock, _tracked(views, model, camera, [0.0], clock), FRAMES)
+
+
+def _of_specimens(count: int) -> Cost:
+    model, camera, clock = _lump(20_480), _camera(900), StepClock()
+    views = _views_of(model)
+    pitch_mm = 0.55 * model.diameter_mm
+    asides = [pitch_mm * (k - 0.5 * (count - 1)) for k in range(count)]
+    clock.last = time.process_time()
+    return _cost(clock, _tracked(views, model, camera, asides, clock), FRAMES)
 
 
 def _box(low: tuple[float, ...], high: tuple[float, ...]) -> tuple[Array, np.ndarray]:
