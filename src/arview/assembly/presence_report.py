@@ -13,7 +13,7 @@ from arview.assembly.observation import ComponentObserver
 from arview.assembly.turned_poses import TurnedPoses
 from arview.cad import Model
 from arview.camera import Camera
-from arview.geometry import Array, rigid
+from arview.geometry import Array, are_near, rigid
 from arview.pose import ComponentPresence, Presence, Visibility
 
 VISIBILITIES = (Visibility.VISIBLE, Visibility.HIDDEN, Visibility.OUTSIDE)
@@ -24,6 +24,8 @@ INSIDE_SHARE = 0.5
 """Share of the corners of a component's box that must be in the picture."""
 VISIBILITY_EVERY = 4
 """Frames from one look at which components are visible to the next, unless they were observed meanwhile."""
+JUMP, JUMP_DEG = 0.1, 5.0
+"""Motion since then, in diameters of the part's box and in degrees, from which they are looked at at once."""
 
 
 class PresenceReport:
@@ -44,12 +46,13 @@ class PresenceReport:
         self._corners = _box_corners(boxes).reshape(-1, 3)
         low, high = boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)
         self._part_corners = _box_corners(np.array([[low, high]])).reshape(-1, 3)
+        self._jump_mm = JUMP * float(np.linalg.norm(high - low))
         self.forget()
 
     def forget(self) -> None:
         """Another state follows: nothing that was reported holds any longer."""
         self._last: tuple[tuple[int, bool, bool, bytes], Mapping[str, ComponentPresence]] | None = None
-        self._visibility: tuple[int, NDArray[np.int8]] | None = None
+        self._visibility: tuple[int, Array, NDArray[np.int8]] | None = None
         self._frames = 0
 
     def presence(
@@ -64,13 +67,11 @@ class PresenceReport:
             may_be_missing: whether the pose is known well enough to call a component missing.
         """
         self._frames += 1
-        if (
-            self._visibility is None
-            or self._visibility[0] != state.observations
-            or self._frames % VISIBILITY_EVERY == 0
-        ):
-            self._visibility = state.observations, self._visibilities(state, cam_from_model)
-        visibilities = self._visibility[1]
+        last = self._visibility
+        is_kept = last is not None and last[0] == state.observations and self._frames % VISIBILITY_EVERY != 0
+        if last is None or not (is_kept and are_near(cam_from_model, last[1], self._jump_mm, JUMP_DEG)):
+            last = self._visibility = state.observations, cam_from_model, self._visibilities(state, cam_from_model)
+        visibilities = last[2]
         key = (state.observations, is_ambiguous, may_be_missing, visibilities.tobytes())
         if self._last is None or self._last[0] != key:
             found = self._presence_now(state, visibilities, is_ambiguous, may_be_missing)

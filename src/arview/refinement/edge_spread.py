@@ -23,8 +23,8 @@ SPREAD_MIN_STEP = 6.0
 """Weaker steps, in grey levels per sample, are not used, because noise widens them."""
 SPREAD_FLANK = 0.15
 """The step ends where the slope falls below this share of its maximum."""
-SPREAD_OF_SAMPLING = 1.15
-"""Variance, px², that smoothing over 3×3 pixels, interpolation and the difference of samples add to a step."""
+SPREAD_OF_SMOOTHING, SPREAD_OF_SAMPLING = 0.67, 0.48
+"""Variance, px², that smoothing over 3×3 pixels, and interpolation and the difference of samples add to a step."""
 SPREAD_MIN_POINTS = 12
 """Edge points with a usable step needed for an estimate."""
 
@@ -54,6 +54,7 @@ def edge_spread(
     kinds = part.edge_kinds[first:last:2]
     height, width = smooth.shape
     pitch = intrinsics[10]
+    added = SPREAD_OF_SMOOTHING + SPREAD_OF_SAMPLING / max(pitch, 1.0) ** 2
     size = 2 * SPREAD_REACH + 1
     profile = np.empty(size)
     spreads = np.empty(kinds.shape[0])
@@ -90,7 +91,7 @@ def edge_spread(
             high += 1
         step = sign * (profile[high] - profile[low])
         sigma = step / (2.5066 * abs(steepest))
-        spreads[count] = np.sqrt(max(sigma * sigma - SPREAD_OF_SAMPLING, 0.0))
+        spreads[count] = np.sqrt(max(sigma * sigma - added, 0.0))
         count += 1
     if count < SPREAD_MIN_POINTS:
         return -1.0

@@ -26,7 +26,7 @@ _RESPONSE = (8.0 / (4 * 255)) ** 2
 LEVELS = 4
 """Levels of the image pyramid. The common shift is searched for at the coarsest, where 4 px are 32 px of the
 picture."""
-MAX_CORNERS = 60
+MAX_CORNERS = 90
 """Corners kept in a keyframe."""
 MIN_CORNERS = 12
 """Corners needed for a keyframe."""
