@@ -63,7 +63,7 @@ SCORE_RATE = 0.1
 """Share by which the usual score follows each frame."""
 OTHER_SCHEDULES_SHARE = 0.9
 """Share of the usual score in the working picture below which other schedules are tried."""
-OTHER_SCHEDULES_FINE_SHARE = 0.7
+OTHER_SCHEDULES_FINE_SHARE = 0.8
 """Share of the usual score in the finest picture, in which scores vary more, below which other schedules are tried."""
 NEAR_SCHEDULES_MIN_INNER_SHARE = 0.05
 """Share of design edges needed for schedules without colours, because the apparent outline of a rounded part moves with
@@ -250,7 +250,8 @@ class Tracker:
         if self.state.is_started and self._is_usual(frame):
             return
         first = frame.found
-        if self.state.is_futile(first.scores.mean, FUTILE_FRAMES, FUTILE_SHARE):
+        is_expected = self._motion(frame, first) < SURPRISE
+        if is_expected and self.state.is_futile(first.scores.mean, FUTILE_FRAMES, FUTILE_SHARE):
             return
         if frame.matches is not None:
             yield Proposal(frame.start, LAST_STAGES, frame.matches, first_level=-1)
@@ -267,7 +268,7 @@ class Tracker:
             if frame.found.evidence.score >= FAR_SCHEDULES_SHARE * self.state.usual_score:
                 return
             yield Proposal(frame.start, stages, frame.matches, MIN_GAIN)
-        if frame.found is first:
+        if self.state.is_started and frame.found.scores.mean <= first.scores.mean + MIN_GAIN:
             self.state.futile = (self.state.frames, first.scores.mean)
 
     def _searched(self, frame: FrameContext) -> Iterator[Proposal]:
