@@ -28,7 +28,8 @@ def covariance_of(information: Array, quality: float, diameter_mm: float, correl
     total = information / scale
     for i in range(6):
         total[i, i] += 4.0 if i < 3 else 4.0 / diameter_mm**2
-    return np.linalg.inv(total)
+    inverse: Array = np.linalg.inv(total)
+    return inverse
 
 
 @kernel

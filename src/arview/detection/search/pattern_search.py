@@ -206,7 +206,7 @@ def outline_score(
         buffer[2, i] = ((angles[i] + turn) >> 5) & 7
         column, row = buffer[0, i], buffer[1, i]
         if 0 <= column < width and 0 <= row < height:
-            unshifted += np.int64(maps[buffer[2, i], row, column])
+            unshifted += int(maps[buffer[2, i], row, column])
     count = points.shape[0]
     counted = count * (1.0 - TRIMMED_SHARE) if is_trimmed else 1.0 * count
     if unshifted < PROMISING_SHARE * best_so_far * 255.0 * counted:
