@@ -28,8 +28,7 @@ def covariance_of(information: Array, quality: float, diameter_mm: float, correl
     total = information / scale
     for i in range(6):
         total[i, i] += 4.0 if i < 3 else 4.0 / diameter_mm**2
-    inverse: Array = np.linalg.inv(total)
-    return inverse
+    return np.asarray(np.linalg.inv(total), dtype=np.float64)
 
 
 @kernel
