@@ -176,7 +176,7 @@ def test_a_session_without_a_part_is_refused() -> None:
 
 def test_specimens_of_one_part_share_their_detector() -> None:
     first, second = session_of(tracked("one"), tracked("two")).specimens
-    assert first.search.detector is second.search.detector and first.search.memory is not second.search.memory
+    assert first.search.detector is second.search.detector
 
 
 def test_each_specimen_is_confirmed_and_reset_by_itself(monkeypatch: pytest.MonkeyPatch) -> None:

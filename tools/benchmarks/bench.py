@@ -29,7 +29,7 @@ from suites.cloud_cost import cloud_costs
 from suites.lenses import lens_errors
 from suites.live_latency import live_latencies
 from suites.registration import MEASURED, REFERENCE, registrations
-from suites.scaling import GROWTHS, Cost, plot, slope
+from suites.scaling import COST_RUNS, Cost, plot, slope
 
 TableRow = tuple[str, str, str]
 CLOUD_POINTS = (1_000_000, 20_000_000)
@@ -181,7 +181,7 @@ def bench_costs() -> tuple[dict[str, Any], list[TableRow]]:
     figures: dict[str, Any] = {}
     rows: list[TableRow] = []
     grown: dict[str, dict[int, Cost]] = {}
-    for what, (run, sizes, result) in GROWTHS.items():
+    for what, (run, sizes, result) in COST_RUNS.items():
         costs = grown[what] = {size: run(size) for size in watched(sizes, what)}
         for size, cost in costs.items():
             figures[f"{size} {what}"] = asdict(cost)

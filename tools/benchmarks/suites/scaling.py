@@ -1,4 +1,4 @@
-"""Cost of each step by what grows, in CPU time and memory, in a process of its own each; see `GROWTHS`."""
+"""Cost of each step by what grows, in CPU time and memory, in a process of its own each; see `COST_RUNS`."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def part_cost(count: int) -> Cost:
     return _alone(_of_specimens, count)
 
 
-GROWTHS: dict[str, tuple[Callable[[int], Cost], tuple[int, ...], str]] = {
+COST_RUNS: dict[str, tuple[Callable[[int], Cost], tuple[int, ...], str]] = {
     "photos": (photo_cost, (12, 24, 48, 96), "placed"),
     "components in a cloud": (component_cost, (10, 30, 100, 300), "within U"),
     "triangles": (triangle_cost, (20_480, 81_920, 327_680, 1_310_720), "frames tracked"),
