@@ -77,7 +77,7 @@ class GuideView:
     features: ViewFeatures
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class GuideViewSet:
     """All guide views of a model.
 

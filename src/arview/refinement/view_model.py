@@ -8,7 +8,7 @@ missed or confused with each other, and a test that expects them rejects right p
 from __future__ import annotations
 
 from functools import cached_property
-from weakref import WeakKeyDictionary
+from weakref import WeakValueDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,9 +80,11 @@ class PartView:
     @classmethod
     def of(cls, views: GuideViewSet) -> PartView:
         """The part of guide views, made once for all that use these views."""
-        if views not in _shared:
-            _shared[views] = cls(views)
-        return _shared[views]
+        # A part keeps its views, so that no other ones get their id while it is here.
+        part = _shared.get(id(views))
+        if part is None:
+            part = _shared[id(views)] = cls(views)
+        return part
 
     @cached_property
     def resolvable(self) -> ViewArrays:
@@ -92,7 +94,7 @@ class PartView:
         return self.arrays._replace(edge_kinds=kinds)
 
 
-_shared: WeakKeyDictionary[GuideViewSet, PartView] = WeakKeyDictionary()
+_shared: WeakValueDictionary[int, PartView] = WeakValueDictionary()
 
 
 def _without_rough(kinds: NDArray[np.uint8]) -> NDArray[np.uint8]:
