@@ -83,7 +83,7 @@ Examples:
     help="Frames to measure of a video without photos.",
 )
 @click.option("--no-repeatability", is_flag=True, help="Do not measure two halves of the photos apart to compare them.")
-@click.option("--no-cloud", is_flag=True, help="Measure in the photos only: no dense cloud, no foreign objects.")
+@click.option("--no-cloud", is_flag=True, help="Measure in photos only: no cloud; foreign objects are not looked for.")
 @click.option("--no-pdf", is_flag=True, help="Write the report as HTML only.")
 @click.option(
     "--seed", type=click.IntRange(min=0), default=0, show_default=True, help="The same seed gives the same cloud."

@@ -109,7 +109,6 @@ def measurement_key(prepared: Prepared) -> str:
         made,
         poses,
         job.compares_halves,
-        *(() if job.makes_cloud else ("no cloud",)),
         _content(job.camera),
         part.model.source_hash,
         part.name,

@@ -167,7 +167,6 @@ class _InspectionRun:
         self.seconds: dict[str, float] = {}
         self.verdict: list[StageRecord] = []
         self.in_photos: dict[str, Any] = {}
-        self._last_stage = prepared.reconstruct.last_stage
 
     def execute(
         self, starts_over: bool, on_verdict: Callable[[Inspection], None] | None = None, is_settled: bool = False
@@ -289,7 +288,13 @@ class _InspectionRun:
             save_inspection(inspection, path)
             return ""
 
-        self._once("measure", "measurement", key_of(inputs, self.stages.key(self._last_stage)), [path], work)
+        self._once(
+            "measure",
+            "measurement",
+            key_of(inputs, self.stages.key(self.prepared.reconstruct.last_stage)),
+            [path],
+            work,
+        )
         inspection = load_inspection(path, part.model)
         self.records[-1] = replace(self.records[-1], note=verdict_sentence(inspection))
         return inspection
@@ -309,7 +314,12 @@ class _InspectionRun:
             self.warnings += evidence.absent.values()
             return "HTML and PDF" if pdf.is_file() else "HTML"
 
-        key = key_of(content_key([source]), self.stages.key(self._last_stage), part.model.source_hash, __version__)
+        key = key_of(
+            content_key([source]),
+            self.stages.key(self.prepared.reconstruct.last_stage),
+            part.model.source_hash,
+            __version__,
+        )
         if not wants_pdf:
             pdf.unlink(missing_ok=True)
         self._once("report", "report", key, [html, pdf] if wants_pdf else [html], work)
