@@ -265,21 +265,19 @@ def run_evidence(
     step_mm: float,
     edge_threshold: float,
     tolerance_px: float,
-    stride: int,
 ) -> EvidenceTerms:
     """`EvidenceTerms` of the picture for a pose; arguments as of `run_stages`.
 
     Args:
         has_colors: whether ``colors`` have been learned.
         tolerance_px: steps at most this far from an edge support it.
-        stride: every n-th edge point is measured.
     """
     view = nearest_view(part.directions, cam_from_body)
     first, last = part.edge_starts[view], part.edge_starts[view + 1]
-    points, tangents = part.edge_points[first:last:stride], part.edge_tangents[first:last:stride]
+    points, tangents = part.edge_points[first:last], part.edge_tangents[first:last]
     lines = project_lines(points, tangents, True, cam_from_body, intrinsics, step_mm)
     profiles = measure_edges(gray, lines, EVIDENCE_REACH, EVIDENCE_STEP_PX, edge_threshold, intrinsics[10])
-    edges = edge_evidence(profiles, part.edge_kinds[first:last:stride], EVIDENCE_REACH * EVIDENCE_STEP_PX, tolerance_px)
+    edges = edge_evidence(profiles, part.edge_kinds[first:last], EVIDENCE_REACH * EVIDENCE_STEP_PX, tolerance_px)
     region_support, region_information = -1.0, 0.0
     if has_colors:
         first, last = part.contour_starts[view], part.contour_starts[view + 1]

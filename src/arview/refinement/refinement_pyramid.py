@@ -99,7 +99,7 @@ class RefinementPyramid:
         evidence = self.working.evidence(cam_from_body, appearance)
         if len(self.scales) == 1:
             return PoseScores(evidence, evidence.score)
-        return PoseScores(evidence, self.finest.evidence(cam_from_body, appearance, stride=2).score)
+        return PoseScores(evidence, self.finest.evidence(cam_from_body, appearance).score)
 
     def cover(self, poses: Sequence[Array]) -> None:
         """Make all pictures show the part at some other poses (4,4), too."""
@@ -191,10 +191,10 @@ class PictureRefiner:
         stored = self.picture.camera.magnified(self.picture.pitch)
         return self.refiner.with_camera(stored).refine_shading(gray_of(self.picture.image), cam_from_body, information)
 
-    def evidence(self, cam_from_body: Array, appearance: Appearance, stride: int = 1) -> PoseEvidence:
-        """Evidence of the picture for a pose (4,4), of every n-th edge point."""
+    def evidence(self, cam_from_body: Array, appearance: Appearance) -> PoseEvidence:
+        """Evidence of the picture for a pose (4,4)."""
         used = appearance if self.picture.has_colors else NO_COLORS
-        return self.refiner.evidence(self.picture.image, self.picture.smooth, cam_from_body, used, stride=stride)
+        return self.refiner.evidence(self.picture.image, self.picture.smooth, cam_from_body, used)
 
     def learn_colors(self, cam_from_body: Array, appearance: Appearance, rate: float) -> None:
         """Blend the colours along the outline at a pose (4,4) into an appearance."""

@@ -275,12 +275,8 @@ class PoseRefiner:
         cam_from_body: Array,
         appearance: Appearance,
         tolerance_px: float = 1.5,
-        stride: int = 1,
     ) -> PoseEvidence:
-        """Evidence of the picture for a pose (4,4), of every n-th edge point.
-
-        Steps farther from an edge than the tolerance do not support it.
-        """
+        """Evidence of the picture for a pose (4,4); steps farther from an edge than the tolerance do not support it."""
         terms = run_evidence(
             image,
             gray,
@@ -292,7 +288,6 @@ class PoseRefiner:
             self._step_mm,
             EDGE_THRESHOLD,
             tolerance_px,
-            stride,
         )
         return PoseEvidence(*terms)
 

@@ -48,10 +48,8 @@ MIN_MATCH_SHARE = 0.4
 TEXTURE_SCORE = 0.5
 """Score that texture adds to the quality when all of it is found, because it supports the pose where a hand hides the
 outline."""
-LEARNING_EVERY = 2
-"""Frames from one look at colours and blur of the edges to the next."""
-LEARNING_RATE = 0.36
-"""Share by which the colour histograms follow each look."""
+LEARNING_RATE = 0.2
+"""Share by which the colour histograms follow each frame."""
 MIN_LEARNING_QUALITY = 0.4
 """Quality below which colours are not learned, and the part is searched for around the predicted pose."""
 MIN_EDGE_SUPPORT, NEW_EDGE_SUPPORT = 0.65, 0.7
@@ -63,7 +61,7 @@ SCORE_RATE = 0.1
 """Share by which the usual score follows each frame."""
 OTHER_SCHEDULES_SHARE = 0.9
 """Share of the usual score in the working picture below which other schedules are tried."""
-OTHER_SCHEDULES_FINE_SHARE = 0.8
+OTHER_SCHEDULES_FINE_SHARE = 0.7
 """Share of the usual score in the finest picture, in which scores vary more, below which other schedules are tried."""
 NEAR_SCHEDULES_MIN_INNER_SHARE = 0.05
 """Share of design edges needed for schedules without colours, because the apparent outline of a rounded part moves with
@@ -95,8 +93,8 @@ MIN_KEYFRAME_SUPPORT = 0.85
 part."""
 SUPPORT_DECAY = 0.99
 """Factor by which the best recent support of the outline decreases in each frame."""
-SPREAD_RATE = 0.5
-"""Share by which the estimated blur of the edges follows each look."""
+SPREAD_RATE = 0.3
+"""Share by which the estimated blur of the edges follows each frame."""
 VELOCITY_DECAY = 0.9
 """Share of the last frame's motion that is expected in the next frame."""
 
@@ -414,11 +412,9 @@ class Tracker:
         state.edge_support += SUPPORT_RATE * (evidence.contour_support - state.edge_support)
         self._choose_modalities()
         state.frames += 1
-        is_due = state.frames % LEARNING_EVERY == 0
-        if is_due:
-            self._measure_spread(frame.levels, SPREAD_RATE)
+        self._measure_spread(frame.levels, SPREAD_RATE)
         if quality > MIN_LEARNING_QUALITY:
-            if o.use_region and is_due:
+            if o.use_region:
                 frame.levels.finest_colors.learn_colors(pose, state.appearance, LEARNING_RATE)
             if self._texture is not None:
                 self._remember_texture(frame)
