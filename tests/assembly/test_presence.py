@@ -163,7 +163,7 @@ def test_a_session_follows_a_part_of_which_most_is_absent() -> None:
     absent = ("post_1", "post_2", "block_1", "rail")
     model = changed(**dict.fromkeys(absent))
     session = SpecimenTracking(assembly_views(), CAMERA, assembly(), initial_cam_from_model=path(1, 4)[0])
-    for k, pose in enumerate(path(24, 4)):
+    for k, pose in enumerate(path(36, 4)):
         result = session.process(picture(pose, model, seed=k, scene=4, noise=4.0), k, k / 30)
         assert result.cam_from_model is not None, f"frame {k}: {result.reason}"
         assert not any(result.components[name].presence is Presence.PRESENT for name in absent)
