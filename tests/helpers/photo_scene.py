@@ -50,11 +50,12 @@ def ring(count: int, distance_mm: float = 520.0, elevations_deg: tuple[float, ..
 
 def photograph(
     model: Model, cam_from_model: Array, camera: Camera = CAMERA, seed: int = 0, noise: float = 2.0,
-    moves: Mapping[str, Array] | None = None,
+    moves: Mapping[str, Array] | None = None, is_linear: bool = False,
 ) -> Picture:  # fmt: skip
     """The picture of a model, (H,W,3) uint8: twice the size, then through the lens, with noise.
 
-    Components are taken along by ``moves`` (4,4), and their texture with them.
+    Components are taken along by ``moves`` (4,4), and their texture with them. With ``is_linear`` a pixel averages the
+    light that falls on it, as that of a camera does, not grey levels: an edge is then where it is found.
     """
     twice = camera.without_distortion().scaled(2 * camera.width, 2 * camera.height)
     places = [(moves or {}).get(component.name, np.eye(4)) for component in model.components]
@@ -86,8 +87,12 @@ def photograph(
         place = texture_from_cam[owner[seen]]
         grey = np.full(face.shape, 30.0)
         grey[v, u] = PAINT(np.einsum("nij,nj->ni", place[:, :3, :3], in_cam) + place[:, :3, 3]) * (light * tone)[seen]
+    if is_linear:
+        grey = 255.0 * (np.clip(grey, 0.0, 255.0) / 255.0) ** 2.2
     small = cv2.resize(grey, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
     through = _through_lens(small, camera)
+    if is_linear:
+        through = 255.0 * (np.maximum(through, 0.0) / 255.0) ** (1.0 / 2.2)
     through += np.random.default_rng(int(abs(cam_from_model[:3].sum()) * 1e3) + seed).normal(0.0, noise, through.shape)
     return np.repeat(np.clip(through, 0, 255).astype(np.uint8)[..., None], 3, axis=2)
 

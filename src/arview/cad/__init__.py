@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from arview.cad.model import Component as Component
     from arview.cad.model import Model as Model
     from arview.cad.model import make_model as make_model
+    from arview.cad.part import Characteristic as Characteristic
     from arview.cad.part import ComponentSettings as ComponentSettings
     from arview.cad.part import Datum as Datum
     from arview.cad.part import DatumFeature as DatumFeature
@@ -66,6 +67,7 @@ __getattr__, __dir__, __all__ = lazy_door(
             "make_model",
         ),
         "part": (
+            "Characteristic",
             "ComponentSettings",
             "Datum",
             "DatumFeature",

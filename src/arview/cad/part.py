@@ -121,6 +121,48 @@ class Datum:
         return f"{self.feature}_{self.label}"
 
 
+CharacteristicKind = Literal[
+    "position", "profile", "flatness", "perpendicularity", "parallelism", "angularity",
+    "size", "distance", "gap", "flush",
+]  # fmt: skip
+"""Characteristics of a drawing: those with a tolerance zone (ISO 1101), and those between limits."""
+
+ZoneShape = Literal["diameter", "sphere", "width"]
+"""A tolerance zone: a cylinder about an axis, a sphere, or the space between two planes."""
+
+
+@dataclass(frozen=True)
+class Characteristic:
+    """A requirement of the drawing on features or components.
+
+    Attributes:
+        name: as the reports call it.
+        kind: what is limited.
+        of: names of features or components. Several of a kind with a zone are a pattern, which must comply at once; a
+            distance, gap or flush is between two.
+        tolerance_mm: diameter of the zone, or its width; None for a kind with limits.
+        limits_mm: smallest and largest value of a kind with limits; None: not limited.
+        zone: shape of the zone.
+        direction_in_model: (3,) unit, across a zone between planes or along a distance; None: the feature's own.
+        datums: labels of the datums of its frame, in order of precedence; what they leave free is free.
+        is_at_maximum: the zone grows with the distance of the measured size from maximum material.
+        datums_at_maximum: labels of the round datums from which the features may shift by that distance.
+        source: where it comes from, such as a balloon of the drawing or the PMI of the CAD file.
+    """
+
+    name: str
+    kind: CharacteristicKind
+    of: tuple[str, ...]
+    tolerance_mm: float | None = None
+    limits_mm: tuple[float | None, float | None] = (None, None)
+    zone: ZoneShape = "width"
+    direction_in_model: Vector | None = None
+    datums: tuple[str, ...] = ()
+    is_at_maximum: bool = False
+    datums_at_maximum: tuple[str, ...] = ()
+    source: str = ""
+
+
 @dataclass(frozen=True)
 class Guide:
     """A named view that the part can be brought into; None leaves a value to the declared range."""
@@ -145,6 +187,8 @@ class Part:
         view_range: the declared one, or None; see `default_view_range`.
         symmetries: declared rotations of the whole part.
         datums: in order of precedence.
+        features: that characteristics are about; a feature is described like a datum, its label is its name.
+        characteristics: requirements of the drawing beside the tolerances of the components.
         guides: views of the part file.
         serial: serial number of the specimen, or None.
         serial_pattern: regular expression that a code on the part must match to be a serial number; empty: the form of
@@ -162,6 +206,8 @@ class Part:
     view_range: ViewRange | None = None
     symmetries: tuple[Symmetry, ...] = ()
     datums: tuple[Datum, ...] = ()
+    features: tuple[Datum, ...] = ()
+    characteristics: tuple[Characteristic, ...] = ()
     guides: tuple[Guide, ...] = ()
     serial: str | None = None
     serial_pattern: str = ""

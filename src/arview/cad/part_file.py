@@ -10,6 +10,7 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any, cast
 
+from arview.cad.characteristics_table import read_characteristics
 from arview.cad.formats.raw import UNIT_MM
 from arview.cad.load import SUFFIXES, LoadedCad, check_step_tolerances, load_cad
 from arview.cad.model import Model, make_model
@@ -35,6 +36,10 @@ from arview.errors import InputError
 
 ROLES = ("base", "inspect", "ignore")
 POINTS = ("mass", "seat", "axis", "hole")
+TABLES = (
+    "part", "view_range", "guides", "defaults", "components", "symmetry", "datums", "features", "characteristics",
+    "rework",
+)  # fmt: skip
 DATUM_FEATURES = ("plane", "hole", "pin", "cylinder", "edge", "point", "fit")
 
 PART_FILE_EXAMPLE = """\
@@ -135,6 +140,41 @@ point_mm = [-97.0, -67.0, 0.0] # on the axis, at the end that the camera sees
 axis = [0.0, 0.0, 1.0]
 diameter_mm = 12.0
 locks = ["tx", "ty"]           # default: all that it determines; of rx ry rz tx ty tz, axes of the model
+
+# Features that the drawing limits, each named as it is called in the reports and described as a datum is.
+[features.bore_1]
+feature = "hole"
+component = "base_plate"
+point_mm = [97.0, 67.0, 0.0]
+axis = [0.0, 0.0, 1.0]
+diameter_mm = 12.0
+
+# What the drawing requires of features and components (ISO 1101), beside the tolerances above; `arview check --pmi`
+# proposes it from STEP AP242. position, profile, flatness, perpendicularity, parallelism, angularity have a
+# tolerance_mm; size, distance, gap and flush min_mm, max_mm or both.
+[[characteristics]]
+name = "place of bore 1"
+kind = "position"
+of = "bore_1"                  # a feature or component; a list of them is a pattern, which must comply at once
+tolerance_mm = 0.4             # diameter or width of the zone
+# zone = "diameter"            # default for round features; "sphere" for components and points, "width" for others
+# direction = [1.0, 0.0, 0.0]  # across a zone of some width; default: the feature's normal
+datums = ["A", "B"]            # default: all; ["A", "B(M)"] lets it shift by what B is off maximum material
+at_maximum_material = true     # the zone grows by what the bore is wider than its smallest size, see its size
+
+[[characteristics]]
+name = "width of bore 1"
+kind = "size"                  # diameter
+of = "bore_1"
+min_mm = 11.9
+max_mm = 12.1
+
+[[characteristics]]
+name = "pitch"
+kind = "distance"              # of two features; gap: along the first one's normal; flush: step between two faces
+of = ["bore_1", "post_1"]
+min_mm = 35.0
+# source = "drawing 4711, balloon 12"
 """
 """A complete part file with comments; what `arview check --help` shows."""
 
@@ -202,7 +242,7 @@ def part_from_text(
 
 
 def _read_part(root: TomlTable, path: Path, unit: str | None, load: Callable[..., LoadedCad]) -> Part:
-    for key in ("part", "view_range", "guides", "defaults", "components", "symmetry", "datums", "rework"):
+    for key in TABLES:
         root.known(key)
     root.finish()
     head = root.table("part", required=True)
@@ -228,6 +268,8 @@ def _read_part(root: TomlTable, path: Path, unit: str | None, load: Callable[...
     view_range = replace(view_range, up=up) if view_range else None
     names = [component.name for component in cad.model.components]
     datums = _read_datums(root.table("datums"), cad.model)
+    features = _read_datums(root.table("features"), cad.model)
+    characteristics = read_characteristics(root.tables("characteristics"), names, datums, features)
     rework = _ReworkTables(read_rework_kinds(root.table("rework")), [*names, *(d.feature_name for d in datums)])
     defaults = _read_settings(root.table("defaults"), "", cad.model, ComponentSettings(""), rework)
     tables = root.table("components")
@@ -258,6 +300,8 @@ def _read_part(root: TomlTable, path: Path, unit: str | None, load: Callable[...
         view_range=view_range,
         symmetries=symmetries,
         datums=datums,
+        features=features,
+        characteristics=characteristics,
         guides=guides,
         serial=serial,
         serial_pattern=serial_pattern,

@@ -120,6 +120,21 @@ class TomlTable:
             self.fail(key, value, "a positive number")
         return float(value)
 
+    def number(self, key: str) -> float | None:
+        """A number; None when the key is absent."""
+        if not self.known(key):
+            return None
+        if not _is_number(self.content[key]):
+            self.fail(key, self.content[key], "a number")
+        return float(self.content[key])
+
+    def flag(self, key: str) -> bool:
+        """True or false; false when the key is absent."""
+        value = self.content[key] if self.known(key) else False
+        if not isinstance(value, bool):
+            self.fail(key, value, "true or false")
+        return bool(value)
+
     def angle(self, key: str, max_deg: float = 360.0) -> float:
         """A required number whose magnitude does not exceed a limit."""
         value = self.take(key)

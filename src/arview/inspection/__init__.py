@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from arview.inspection.fingerprint import fingerprint_of_file as fingerprint_of_file
     from arview.inspection.fingerprint import values_fingerprint as values_fingerprint
     from arview.inspection.record import SCHEMA_VERSION as SCHEMA_VERSION
+    from arview.inspection.record import CharacteristicResult as CharacteristicResult
     from arview.inspection.record import ComponentDeviation as ComponentDeviation
     from arview.inspection.record import Finding as Finding
     from arview.inspection.record import Inspection as Inspection
@@ -81,6 +82,7 @@ __getattr__, __dir__, __all__ = lazy_door(
             "values_fingerprint",
         ),
         "record": (
+            "CharacteristicResult",
             "ComponentDeviation",
             "Finding",
             "Inspection",

@@ -15,6 +15,7 @@ from arview.inspection.details import (
     from_json,
 )
 from arview.inspection.record import (
+    CharacteristicResult,
     ComponentDeviation,
     Finding,
     Inspection,
@@ -48,6 +49,7 @@ def from_document(document: dict[str, Any]) -> Inspection:
             options=tuple(source.get("options", {}).items()),
             cpu_s=source.get("cpu_s"),
         ),
+        characteristics=tuple(from_json(CharacteristicResult, one) for one in document.get("characteristics", ())),
         datum_system=None if datums is None else from_json(DatumSystem, datums),
         warnings=tuple(document.get("warnings", ())),
         foreign_objects=tuple(from_json(ForeignReport, one) for one in document.get("foreign_objects", ())),

@@ -22,8 +22,8 @@ from arview.inspection.details import (
     to_json,
 )
 
-SCHEMA_VERSION = "1.2"
-READABLE_VERSIONS = ("1.0", "1.1", "1.2")
+SCHEMA_VERSION = "1.3"
+READABLE_VERSIONS = ("1.0", "1.1", "1.2", "1.3")
 
 _COLUMNS = ("distance_mm", "uncertainty_mm", "tolerance_mm", "tilt_deg", "twist_deg")
 _DISTANCE_SLACK_MM = 0.006
@@ -225,6 +225,56 @@ class ComponentDeviation:
 
 
 @dataclass(frozen=True)
+class CharacteristicResult:
+    """A requirement of the drawing, measured and judged.
+
+    Attributes:
+        name: as the part file has it.
+        kind: position, profile, flatness, …, see `arview.cad.Characteristic`.
+        of: names of its features or components.
+        verdict: result of the decision rule; what could not be measured has no value and does not pass.
+        value_mm: diameter or width of the smallest zone that holds them, or size, distance, gap or flush; None if it
+            was not measured.
+        uncertainty_mm: expanded uncertainty U (k = 2) of ``value_mm``, with that of the bonus.
+        zone_mm: diameter or width that was allowed, bonus included; None for kinds with limits.
+        bonus_mm: share of ``zone_mm`` by which the feature is off maximum material.
+        limits_mm: smallest and largest value allowed; None: not limited.
+        nominal_mm: value of the design, of kinds with limits.
+        datums: labels of its datums, ``B(M)`` at maximum material.
+        point_mm: (3,) where it is shown on the part, in the model.
+        reason: why it was not measured; empty if it was.
+        notes: what the value leaves out.
+        source: where the requirement comes from.
+    """
+
+    name: str
+    kind: str
+    of: tuple[str, ...]
+    verdict: Verdict
+    value_mm: float | None = None
+    uncertainty_mm: float | None = None
+    zone_mm: float | None = None
+    bonus_mm: float = 0.0
+    limits_mm: tuple[float | None, ...] = (None, None)
+    nominal_mm: float | None = None
+    datums: tuple[str, ...] = ()
+    point_mm: tuple[float, ...] = ()
+    reason: str = ""
+    notes: tuple[str, ...] = ()
+    source: str = ""
+
+    @property
+    def excess_mm(self) -> float | None:
+        """By how much the value is beyond its zone or limits, negative within; None if it was not measured."""
+        if self.value_mm is None:
+            return None
+        low, high = self.limits_mm if self.zone_mm is None else (None, self.zone_mm)
+        over = [low - self.value_mm] if low is not None else []
+        over += [self.value_mm - high] if high is not None else []
+        return max(over)
+
+
+@dataclass(frozen=True)
 class Provenance:
     """The origin of the numbers.
 
@@ -261,6 +311,7 @@ class Inspection:
         created: time of the measurement, UTC.
         components: an entry for each inspected component; components of the model may be omitted.
         provenance: origin of the numbers.
+        characteristics: requirements of the drawing, in the order of the part file.
         datum_system: the frame of the deviations; None in files of version 1.0.
         warnings: doubts about the inspection as a whole.
         foreign_objects: objects that are not in the CAD model, the largest first.
@@ -277,6 +328,7 @@ class Inspection:
     created: datetime
     components: tuple[ComponentDeviation, ...]
     provenance: Provenance
+    characteristics: tuple[CharacteristicResult, ...] = ()
     datum_system: DatumSystem | None = None
     warnings: tuple[str, ...] = ()
     foreign_objects: tuple[ForeignReport, ...] = ()
@@ -323,6 +375,8 @@ class Inspection:
                 **{key: value for key, value in more.items() if value},
             },
         }
+        if self.characteristics:
+            document["characteristics"] = to_json(self.characteristics)
         if self.datum_system is not None:
             document["datum_system"] = to_json(self.datum_system)
         if self.warnings:

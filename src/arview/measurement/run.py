@@ -17,7 +17,8 @@ from arview.core.checks import PATH, check_type
 from arview.core.progress import Progress
 from arview.errors import InputError
 from arview.geometry import Array
-from arview.inspection import DistanceReport, FailedDatum, ForeignReport, Inspection
+from arview.inspection import CharacteristicResult, DistanceReport, FailedDatum, ForeignReport, Inspection
+from arview.measurement.characteristics import Frames, measure_characteristics
 from arview.measurement.cloud_report import inspect_cloud, scatter_doubts
 from arview.measurement.datums.alignment import Alignment, align
 from arview.measurement.datums.datum_fit import check_covered
@@ -135,6 +136,15 @@ def _measure(
         record = in_partial_frame(record, failed)
         deviations.append(with_seen_from(with_hidden(record, MOSTLY_HIDDEN) if is_hidden else record, seen))
         tell("uncertainty", done, len(names))
+    characteristics: tuple[CharacteristicResult, ...] = ()
+    if part.characteristics:
+        rough = _rough_frame(alignment.origin_in_model, size_mm := _size_mm(part.model, base))
+        frames = Frames(alignment, rough, size_mm, reconstruction.scale.scale_std or 0.0, poses)
+        measure_one = _datum_measurement(reconstruction, views, part, {})
+        px_mm = views.mm_per_px if views is not None else lambda point: 0.0
+        characteristics = measure_characteristics(
+            part, measure_one, results, measurands, frames, options.decision.guard, px_mm, tell
+        )
     if BY_SHAPE in warnings:
         deviations, doubts = with_unsure_names(deviations, part)
         warnings += doubts
@@ -155,6 +165,7 @@ def _measure(
         created=datetime.now(UTC),
         components=tuple(deviations),
         provenance=provenance_of(reconstruction, options, time.process_time() - began),
+        characteristics=characteristics,
         datum_system=datum_record(alignment, part, base, reconstruction, failed),
         warnings=tuple(warnings),
         foreign_objects=foreign,
@@ -251,7 +262,7 @@ def align_to_datums(
         origin = np.array((holes or part.datums)[0].point_in_model)
     else:
         origin = fitted[next(name for name in base if name in fitted)].center_in_model
-    size_mm = 0.5 * float(np.linalg.norm(np.ptp(_bounds(part.model, base), axis=0)))
+    size_mm = _size_mm(part.model, base)
     kinds = {evidence.kind for evidence in reconstruction.scale.evidence if evidence.is_used}
     scale_std = reconstruction.scale.scale_std or 0.0
     finds_scale = bool(kinds) and kinds <= {"cad"}
@@ -337,7 +348,7 @@ def _as_move(name: str, together: CombinedMove) -> Move:
     )
 
 
-def _bounds(model: Model, names: Sequence[str]) -> Array:
-    """(2,3) common bounding box of some components, mm."""
+def _size_mm(model: Model, names: Sequence[str]) -> float:
+    """Half the diagonal of the common bounding box of some components."""
     corners = np.concatenate([model.component(name).bounds_in_model for name in names])
-    return np.stack([corners.min(axis=0), corners.max(axis=0)])
+    return 0.5 * float(np.linalg.norm(np.ptp(corners, axis=0)))

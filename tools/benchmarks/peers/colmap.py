@@ -15,7 +15,7 @@ import numpy as np
 
 from peers.alone import alone, cpu_s
 from peers.programs import MissingPeerError
-from suites.scaling import PLATE, write_photos
+from suites.scaling import write_photos
 
 GET = "pip install pycolmap"
 
@@ -118,7 +118,7 @@ def photo_rows(folder: Path | None, part: Path | None, count: int, rounds: int) 
         raise MissingPeerError(GET)
     with tempfile.TemporaryDirectory() as made:
         if folder is None:
-            folder, part = Path(made) / "photos", PLATE / "part.toml"
+            folder, part = Path(made) / "photos", None
             write_photos(folder, count)
         photos = sum(path.is_file() for path in folder.iterdir())
         works: dict[str, Callable[[], PhotoRun]] = {

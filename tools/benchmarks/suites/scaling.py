@@ -6,6 +6,7 @@ import json
 import math
 import multiprocessing
 import resource
+import sys
 import tempfile
 import time
 from collections import defaultdict
@@ -14,7 +15,6 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
@@ -24,9 +24,8 @@ from arview.cad import ViewRange, load_part
 from arview.cad.model import Component, Model, make_model
 from arview.cad.part import ComponentSettings, Part
 from arview.camera import Camera
-from arview.camera.read import load_camera
 from arview.detection import Detector
-from arview.geometry import Array, apply, exp_so3, rigid
+from arview.geometry import Array, apply, exp_so3, look_at, rigid
 from arview.guideviews import GuideViewOptions, GuideViewSet, make_guide_views
 from arview.measurement.cloud.mesh_surface import MeshSurface
 from arview.measurement.folder import read_cloud, read_folder
@@ -37,11 +36,12 @@ from arview.rendering import ZBufferRenderer
 from arview.tracking import TrackedPart, TrackingSession
 from recordings import ROOT
 
+sys.path.insert(0, str(ROOT / "tests"))  # the tests' photos with exact truth
+from helpers.photo_scene import photograph
+from helpers.photo_scene import write_photos as write_pictures
+from helpers.plate_scene import as_built, part
+
 PLATE = ROOT / "samples" / "plate"
-SCALE = 0.5
-"""Size of the photos relative to the sample's."""
-TURN_RAD = 0.03
-"""Rotation of the camera about its centre that makes another photo of one of the sample's."""
 PITCH_MM = 40.0
 POINTS_EACH = 4000
 """Points of the cloud on and around each component."""
@@ -73,7 +73,7 @@ class Cost:
 
 
 def photo_cost(count: int) -> Cost:
-    """The way from ``count`` photos of the sample plate to the measurement without a dense cloud."""
+    """The way from ``count`` photos of a plate to the measurement without a dense cloud."""
     return _alone(_from_photos, count)
 
 
@@ -98,7 +98,7 @@ def part_cost(count: int) -> Cost:
 
 
 COST_RUNS: dict[str, tuple[Callable[[int], Cost], tuple[int, ...], str]] = {
-    "photos": (photo_cost, (12, 24, 48, 96), "placed"),
+    "photos": (photo_cost, (12, 24, 48, 96, 192), "placed"),
     "components in a cloud": (component_cost, (10, 30, 100, 300), "within U"),
     "triangles": (triangle_cost, (20_480, 81_920, 327_680, 1_310_720), "frames tracked"),
     "kilopixels": (picture_cost, (300, 900, 2_000, 8_000), "frames tracked"),
@@ -141,53 +141,49 @@ def _alone(work: object, count: int) -> Cost:
 def _from_photos(count: int) -> Cost:
     with tempfile.TemporaryDirectory() as folder:
         camera = write_photos(Path(folder) / "photos", count)
-        part, out, clock = load_part(PLATE / "part.toml"), Path(folder) / "out", StepClock()
+        out, clock = Path(folder) / "out", StepClock()
         options = ReconstructOptions(last_stage="scale")
-        found = reconstruct(Path(folder) / "photos", out, part, str(camera), options, progress=clock)
+        found = reconstruct(Path(folder) / "photos", out, part(), str(camera), options, progress=clock)
         placed = len(found.sparse.photos) if found.sparse is not None else 0
         clock("measure in the photos")
-        measure(read_folder(out, with_cloud=False), part, MeasureOptions(methods=("sweep", "edges")))
+        measure(read_folder(out, with_cloud=False), part(), MeasureOptions(methods=("sweep", "edges")))
         clock("end")
     return _cost(clock, placed, count)
 
 
 def write_photos(folder: Path, count: int) -> Path:
-    """Write photos of the sample, and rotated ones of them, at a reduced size; the path of their camera file."""
-    folder.mkdir(parents=True)
-    camera = load_camera(str(PLATE / "camera.json"))
-    small = camera.scaled(round(SCALE * camera.width), round(SCALE * camera.height))
-    rows, columns = np.mgrid[0 : small.height, 0 : small.width]
-    rays = small.unproject(np.stack([columns.ravel(), rows.ravel()], axis=1).astype(np.float64))
-    paths = sorted((PLATE / "photos").glob("*.jpg"))
-    for index in range(count):
-        again, of_photo = divmod(index, len(paths))
-        image = cv2.imread(str(paths[of_photo]))
-        image = cv2.resize(image, (small.width, small.height), interpolation=cv2.INTER_AREA)
-        if again:
-            turn = exp_so3(TURN_RAD * again * np.array([np.cos(2.4 * index), np.sin(2.4 * index), 0.5]))
-            at = small.project(rays @ turn.T).astype(np.float32).reshape(small.height, small.width, 2)
-            image = cv2.remap(image, at[..., 0], at[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
-            noise = np.random.default_rng(index).normal(0.0, 2.0, image.shape)
-            image = np.clip(image + noise, 0.0, 255.0).astype(np.uint8)
-        cv2.imwrite(str(folder / f"img_{index:03d}.jpg"), image, [cv2.IMWRITE_JPEG_QUALITY, 92])
+    """Write photos of a textured plate from places all around it, no two alike; the path of their camera file."""
+    camera = Camera(1280, 960, 1440.0, 1440.0, 639.5, 479.5, np.array([-0.06, 0.01, 0.0, 0.0, 0.0]))
+    pictures = [photograph(as_built(), pose, camera, seed=4) for pose in _spiral(count)]
+    write_pictures(folder, pictures)
     path = folder.parent / "camera.json"
-    dist = [float(v) for v in small.dist]
-    path.write_text(json.dumps({"width": small.width, "height": small.height, "fx": small.fx, "fy": small.fy,
-                                "cx": small.cx, "cy": small.cy, "dist": dist}))  # fmt: skip
+    path.write_text(json.dumps({"width": camera.width, "height": camera.height, "fx": camera.fx, "fy": camera.fy,
+                                "cx": camera.cx, "cy": camera.cy, "dist": camera.dist.tolist()}))  # fmt: skip
     return path
 
 
+def _spiral(count: int) -> list[Array]:
+    """``cam_from_model`` (4,4) of cameras around the plate, on three turns from low to high."""
+    poses = []
+    for share in np.linspace(0.0, 1.0, count):
+        azimuth, elevation = 6.0 * np.pi * share, np.radians(30.0 + 35.0 * share)
+        flat = np.cos(elevation)
+        place = 420.0 * np.array([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)])
+        poses.append(look_at(place, [0.0, 0.0, 5.0], [0.0, 0.0, 1.0]))
+    return poses
+
+
 def _in_cloud(count: int) -> Cost:
-    part, moves = plate_with_posts(count)
+    boxes, moves = plate_with_posts(count)
     clock = StepClock()
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "cloud.xyz"
-        _write_cloud(path, part, moves)
+        _write_cloud(path, boxes, moves)
         clock("read")
         found = read_cloud(path)
         placed = replace(found, scale=replace(found.scale, model_from_scan=np.eye(4)))
         with threadpool_limits(1, "blas"):
-            inspection = measure(placed, part, MeasureOptions(methods=("cloud",)), progress=clock)
+            inspection = measure(placed, boxes, MeasureOptions(methods=("cloud",)), progress=clock)
         clock("end")
     good = 0
     for one in inspection.components:
@@ -286,8 +282,7 @@ def _of_triangles(count: int) -> Cost:
 
 
 def _of_pictures(kilopixels: int) -> Cost:
-    part, camera = load_part(PLATE / "part.toml"), _camera(kilopixels)
-    model, clock = part.model, StepClock()
+    model, camera, clock = load_part(PLATE / "part.toml").model, _camera(kilopixels), StepClock()
     views = _views_of(model)
     detector, image = Detector(views, camera), _drawn(model, camera, [_path(model, 0)], 0)
     detector.detect(image)  # compiled code is loaded

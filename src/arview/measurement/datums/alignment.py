@@ -71,6 +71,7 @@ class Alignment:
         datums: results in order of precedence.
         gains: for each datum the (7,N) derivative of ``move`` by its offsets.
         equations: the equations that were solved.
+        locks: for each of them the (6,K) motions about the origin that it locked.
         notes: messages about what determined what.
     """
 
@@ -81,6 +82,7 @@ class Alignment:
     datums: tuple[DatumResult, ...]
     gains: tuple[Array, ...]
     equations: tuple[DatumEquations, ...]
+    locks: tuple[Array, ...] = ()
     notes: tuple[str, ...] = ()
 
     @property
@@ -122,7 +124,7 @@ def align(
     gain[6, 0] = 1.0
     variances = np.full(gain.shape[1], scale_std**2)
     free, unit = np.eye(6), np.array([1.0 / size_mm] * 3 + [1.0] * 3)
-    found: list[tuple[DatumFit, str]] = []
+    found: list[tuple[DatumFit, Array]] = []
     notes: list[str] = []
     holes = 0
     for one, start in zip(equations, starts, strict=False):
@@ -159,10 +161,9 @@ def align(
             gain = gain - np.outer(change[:, -1], before_gain[6])
             gain[:, 0] += change[:, -1]
         free = orthogonal_complement((columns[:6] / unit[:, None]).T, free.T).T
-        locked = direction_names(columns[:6] / unit[:, None])
-        found.append((fit, locked))
+        found.append((fit, columns[:6]))
         if is_base:
-            notes.append(f"{locked} by the best fit of {one.label}")
+            notes.append(f"{direction_names(columns[:6] / unit[:, None])} by the best fit of {one.label}")
         elif with_scale:
             notes.append(f"scale from the distance of datum {one.label}")
     if free.shape[1]:
@@ -177,26 +178,18 @@ def _result(
     variances: Array,
     equations: Sequence[DatumEquations],
     starts: Array,
-    found: Sequence[tuple[DatumFit, str]],
+    found: Sequence[tuple[DatumFit, Array]],
     notes: tuple[str, ...],
     size_mm: float,
 ) -> Alignment:
     """The alignment with its covariance, and the result of each datum."""
     results, gains = [], []
+    unit = np.array([size_mm] * 3 + [1.0] * 3)[:, None]
     scale_covariance = variances[0] * np.outer(gain[:, 0], gain[:, 0])
     covariance = scale_covariance.copy()
-    for one, start, (fit, locked) in zip(equations, starts, found, strict=False):
+    for one, start, (fit, columns) in zip(equations, starts, found, strict=False):
         part = gain[:, start : start + len(one.offsets_mm)]
-        share = (part * fit.variances) @ part.T
-        if one.feature != "fit":
-            center = one.points.mean(axis=0)
-            reach = max(1.0, float(np.sqrt(((one.points - center) ** 2).sum(axis=1).mean())))
-            rows = one.rows[:, :6] - one.rows[:, 3:6] @ shift_origin(center)[:, :6]
-            common = part @ (rows / np.array([reach] * 3 + [1.0] * 3))
-            share = share + (FORM_MM**2 + one.form_mm**2) * common @ common.T
-            if one.by_form is not None:
-                bent = part @ one.by_form
-                share = share + one.form_mm**2 * bent @ bent.T
+        share = contribution(part, one, fit)
         rows = one.rows - one.rows[:, 3:6] @ shift_origin(origin)
         rest = one.offsets_mm - rows @ move
         if one.by_radius is not None and fit.radius_mm is not None:
@@ -207,7 +200,7 @@ def _result(
             DatumResult(
                 one.label,
                 one.feature,
-                locked,
+                direction_names(columns * unit),
                 used,
                 one.of,
                 fit.sigma_mm,
@@ -221,8 +214,25 @@ def _result(
         covariance = covariance + share
     used_equations = tuple(equations[: len(found)])
     return Alignment(
-        origin, move, covariance, scale_covariance, tuple(results), tuple(gains), used_equations, notes=notes
-    )
+        origin, move, covariance, scale_covariance, tuple(results), tuple(gains), used_equations,
+        locks=tuple(columns for _, columns in found), notes=notes,
+    )  # fmt: skip
+
+
+def contribution(part: Array, one: DatumEquations, fit: DatumFit) -> Array:
+    """(R,R) covariance by noise and form of a datum's offsets, of what has the derivative ``part`` (R,N) by them."""
+    share = (part * fit.variances) @ part.T
+    if one.feature == "fit":
+        return np.asarray(share)
+    center = one.points.mean(axis=0)
+    reach = max(1.0, float(np.sqrt(((one.points - center) ** 2).sum(axis=1).mean())))
+    rows = one.rows[:, :6] - one.rows[:, 3:6] @ shift_origin(center)[:, :6]
+    common = part @ (rows / np.array([reach] * 3 + [1.0] * 3))
+    share = share + (FORM_MM**2 + one.form_mm**2) * common @ common.T
+    if one.by_form is not None:
+        bent = part @ one.by_form
+        share = share + one.form_mm**2 * bent @ bent.T
+    return np.asarray(share)
 
 
 def _solver(design: Array, one: DatumEquations, fit: DatumFit, scale_std: float | None) -> Array:

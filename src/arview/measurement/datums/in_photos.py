@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from arview.cad import Component, Datum, sample_surface
 from arview.errors import InputError
-from arview.geometry import Array
+from arview.geometry import Array, apply
 from arview.measurement.datums.cad_features import edge_line, round_faces
 from arview.measurement.datums.datum_fit import check_covered, robust_weights
 from arview.measurement.datums.equations import (
@@ -35,6 +35,10 @@ SAMPLES = 500
 """Samples on a plane; errors of denser samples are correlated."""
 RIM_POINTS = 120
 """Points around a hole; about one px apart on small ones."""
+BLUR_PX2 = 3.0
+"""Mean square distance, px², over which a step is averaged: along the edge by its parallel profiles, across it by lens,
+sensor and smoothing. Averaged over so much, a curved edge seems to lie farther inside, by half of it times its
+curvature (the blurred edge moves by the heat equation)."""
 RIM_PX = 0.04
 """Expected standard uncertainty of a rim's position by rust, chalk and burrs beside it."""
 
@@ -150,19 +154,21 @@ def _measure_rim(datum: Datum, views: PhotoViews) -> DatumEquations:
         return np.concatenate([directions, np.sum(directions * radial[which[ok]], axis=1)[:, None]], axis=1)
 
     steps = _find_steps(datum, views, edges_at, design_of, 4, px_mm)
+    inward_mm = 0.5 * BLUR_PX2 * _curvatures(views, points)[which, view][steps.ok] * steps.mm_per_px
+    offsets = steps.offsets + inward_mm * np.sign(steps.design[:, 3])
     equations = surface_equations(
         datum.label,
         datum.feature,
         points[which[steps.ok]],
         normals=steps.directions,
-        offsets_mm=steps.offsets,
+        offsets_mm=offsets,
         variances=steps.variances,
         of=len(which),
         by_radius=steps.design[:, 3],
         locks=datum.locks,
     )
     angles = (np.arange(len(points)) * 2 * np.pi / len(points))[which[steps.ok]]
-    shift_mm = rim_shift_mm(steps.design, steps.offsets, steps.variances, angles, RIM_PX * px_mm)
+    shift_mm = rim_shift_mm(steps.design, offsets, steps.variances, angles, RIM_PX * px_mm)
     return replace(equations, form_mm=shift_mm, by_form=waves(steps.design[:, 3], angles))
 
 
@@ -176,6 +182,7 @@ class _Steps:
         offsets: (K,) from nominal along the directions, mm.
         variances: (K,) mm².
         design: (K,U) derivative of the offsets by the unknowns.
+        mm_per_px: (K,) size of a pixel along the directions.
     """
 
     ok: NDArray[np.bool_]
@@ -183,6 +190,7 @@ class _Steps:
     offsets: Array
     variances: Array
     design: Array
+    mm_per_px: Array
 
 
 def _find_steps(
@@ -225,7 +233,19 @@ def _find_steps(
         share, _ = robust_weights(design, offsets, variances)
         weighted = design * (share / variances)[:, None]
         place = np.linalg.pinv(weighted.T @ design, rcond=rcond, hermitian=True) @ (weighted.T @ offsets)
-    return _Steps(ok, directions, offsets, variances, design)
+    return _Steps(ok, directions, offsets, variances, design, found.mm_per_px[ok])
+
+
+def _curvatures(views: PhotoViews, points: Array) -> Array:
+    """(N,M) curvature, 1/px, in each photo, of a closed curve through points (N,3)."""
+    result = np.zeros((len(points), len(views.cameras)))
+    for index, camera in enumerate(views.cameras):
+        pixels = camera.project(apply(views.cam_from_model[index], points))
+        first = 0.5 * (np.roll(pixels, -1, axis=0) - np.roll(pixels, 1, axis=0))
+        second = np.roll(pixels, -1, axis=0) - 2.0 * pixels + np.roll(pixels, 1, axis=0)
+        turn = np.abs(first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0])
+        result[:, index] = turn / np.maximum(np.linalg.norm(first, axis=1), 1e-9) ** 3
+    return result
 
 
 def _rim_views(views: PhotoViews, rim: Rim, points: Array, radial: Array) -> NDArray[np.bool_]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -127,16 +128,27 @@ class PosePropagation:
             shifts.append(moved)
         rows, moved = np.concatenate(arms).reshape(-1, 7), np.concatenate(shifts)
         self.by_scale = np.linalg.lstsq(rows, moved.reshape(len(rows), -1), rcond=1e-10)[0][6]
-        self.frame = np.zeros((7, moved.shape[2]))
+        self.frame = self._frame(alignment)
+
+    def _frame(self, alignment: Alignment) -> Array:
+        """(7,6M) derivative of a datum frame by the poses."""
+        frame = np.zeros((7, len(self.covariance)))
         for one, gain in zip(alignment.equations, alignment.gains, strict=True):
-            self.frame += gain @ self._offsets(one.rows, one.points, one.feature == "fit")
+            frame += gain @ self.offsets(one.rows, one.points, one.feature == "fit")
+        return frame
+
+    def relative_to(self, alignment: Alignment) -> PosePropagation:
+        """The same relative to another datum frame about the same origin."""
+        other = copy.copy(self)
+        other.alignment, other.frame = alignment, self._frame(alignment)
+        return other
 
     def covariance_of(self, component: Component, center: Array) -> Array:
         """(6,6) covariance of a component's twist about its centre (3,), relative to the datum frame."""
-        by_poses = self._twist(component, center) - self.alignment.twist_from_move(center) @ self.frame
+        by_poses = self.twist(component, center) - self.alignment.twist_from_move(center) @ self.frame
         return np.asarray(by_poses @ self.covariance @ by_poses.T)
 
-    def _twist(self, component: Component, center: Array) -> Array:
+    def twist(self, component: Component, center: Array) -> Array:
         """(6,6M) derivative of a component's twist by the poses, with the change of scale removed."""
         points, moved = self._shifts(component)
         moved = moved - (points - self.alignment.origin_in_model)[:, :, None] * self.by_scale
@@ -144,14 +156,14 @@ class PosePropagation:
         unit = np.array([float(np.ptp(points, axis=0).max()) or 1.0] * 3 + [1.0] * 3)
         return np.linalg.lstsq(rows / unit, moved.reshape(len(rows), -1), rcond=1e-3)[0] / unit[:, None]
 
-    def _offsets(self, rows: Array, points: Array, is_fit: bool) -> Array:
+    def offsets(self, rows: Array, points: Array, is_fit: bool = False) -> Array:
         """(N,6M) derivative of a datum's offsets by the poses, with the change of scale removed."""
         origin = self.alignment.origin_in_model
         if is_fit:
             center = points[0]
             arms = rows[:, :3] - np.cross(center, rows[:, 3:6])
             name = min(self.model.components, key=lambda c: float(np.linalg.norm(c.centroid_in_model - center)))
-            return np.concatenate([arms, rows[:, 3:6]], axis=1) @ self._twist(name, center)
+            return np.concatenate([arms, rows[:, 3:6]], axis=1) @ self.twist(name, center)
         normals = rows[:, 3:6]
         # Neighbouring points of a datum are visible in much the same photos, so some of them represent the others.
         step = max(1, len(points) // 40)

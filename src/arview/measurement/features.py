@@ -1,0 +1,209 @@
+"""Features as measurands: where each stands relative to the datum frame, and how wide a round one is.
+
+A feature is measured as a datum is (`measurement.datums`). Its offsets are solved for its own small motion, along all
+that they determine, and for the change of its radius. The derivative of this solution by the offsets carries their
+noise, and the errors of the camera poses, so that features measured in the same photos share theirs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from arview.cad import Component, Datum, DatumFeature
+from arview.core.fits import orthogonal_complement
+from arview.geometry import Array
+from arview.measurement.datums.alignment import Alignment, contribution
+from arview.measurement.datums.cad_features import edge_line, flat_faces, round_faces
+from arview.measurement.datums.datum_fit import DatumFit, check_fit_covered, fit_datum
+from arview.measurement.datums.directions import observable_directions, shift_origin
+from arview.measurement.datums.equations import DatumEquations
+from arview.measurement.uncertainty.combine import CombinedMove
+from arview.measurement.uncertainty.pose_propagation import PosePropagation
+
+STATE = 7
+"""Numbers of a feature's state: twist about its centre in model axes (rad, mm), and the change of its radius, mm."""
+CELLS = 5
+"""Cells along each side of a flat face of whose points the means are its form."""
+MIN_CELL_POINTS = 4
+"""Points of a cell below which its mean says nothing."""
+RADIUS_PX = 0.06
+"""Standard uncertainty of a radius by where along the step of brightness the edge is taken to be, px of the photos."""
+
+
+@dataclass(frozen=True)
+class FlatForm:
+    """Deviation of a flat face from its own best plane.
+
+    Attributes:
+        points: (B,3) middles of its cells, mm.
+        offsets_mm: (B,) along its normal.
+        variances: (B,) mm².
+    """
+
+    points: Array
+    offsets_mm: Array
+    variances: Array
+
+
+@dataclass(frozen=True)
+class MeasuredFeature:
+    """A feature relative to its nominal place in the rough frame.
+
+    Attributes:
+        name: of the feature.
+        feature: its kind; ``fit`` is a whole component.
+        center: (3,) nominal point about which it turns, mm.
+        axis: (3,) its nominal axis or normal.
+        places: (V,3) nominal points between which it extends.
+        radius_mm: nominal; 0 for what is not round.
+        state: (7,) see `STATE`; zero along ``undetermined``.
+        covariance: (7,7) of its own noise and form.
+        undetermined: (K,7) states of about a millimetre that the data leave free.
+        by_poses: (7,P) derivative by the camera poses.
+        form: of a flat face, where its surface was measured.
+    """
+
+    name: str
+    feature: DatumFeature
+    center: Array
+    axis: Array
+    places: Array
+    radius_mm: float
+    state: Array
+    covariance: Array
+    undetermined: Array
+    by_poses: Array
+    form: FlatForm | None = None
+
+
+def feature_of(
+    datum: Datum, component: Component, one: DatumEquations, poses: PosePropagation | None, px_mm: float
+) -> MeasuredFeature:
+    """A feature from its measured offsets.
+
+    Args:
+        datum: the feature as the part file has it.
+        component: that carries it.
+        one: its offsets.
+        poses: for the errors of the camera poses; None leaves them out.
+        px_mm: size of a pixel of the photos there; 0 without photos.
+
+    Raises:
+        DatumNotMeasuredError: too little of it was found.
+    """
+    fit = fit_datum(one, False)
+    check_fit_covered(one, fit)
+    is_rim, axis = datum.feature in ("hole", "pin"), np.array(datum.direction_in_model)
+    point, middle = np.array(datum.point_in_model), one.points.mean(axis=0)
+    # A rim is centred on its axis, at the end that is seen; a face on itself.
+    center = middle if datum.feature in ("plane", "edge") else point + axis * (axis @ (middle - point))
+    rows = one.rows[:, :6] - one.rows[:, 3:6] @ shift_origin(center)[:, :6]
+    reach = max(1.0, float(np.sqrt(np.mean(np.sum((one.points - center) ** 2, axis=1)))))
+    unit = np.array([1.0 / reach] * 3 + [1.0] * 3)
+    allowed = np.eye(6)[:, 3:] if is_rim or datum.feature == "point" else np.eye(6)
+    columns = observable_directions(rows * unit, allowed, fit.weights)
+    design = rows @ (columns * unit[:, None])
+    if one.by_radius is not None:
+        design = np.concatenate([design, one.by_radius[:, None]], axis=1)
+    weighted = design * (fit.weights / fit.weights.max())[:, None]
+    solution = np.linalg.pinv(weighted.T @ design, rcond=1e-12, hermitian=True) @ weighted.T
+    count = columns.shape[1]
+    gain = np.zeros((STATE, len(rows)))
+    gain[:6] = (columns * unit[:, None]) @ solution[:count]
+    if one.by_radius is not None:
+        gain[6] = solution[count]
+    covariance = contribution(gain, one, fit)
+    if one.by_radius is not None:
+        covariance[6, 6] += (RADIUS_PX * px_mm) ** 2
+    free = orthogonal_complement(columns.T) * unit
+    return MeasuredFeature(
+        datum.label,
+        datum.feature,
+        center,
+        axis,
+        _places(datum, component, center),
+        0.5 * (datum.diameter_mm or 0.0),
+        gain @ one.offsets_mm,
+        covariance,
+        np.concatenate([free, np.zeros((len(free), 1))], axis=1),
+        np.zeros((STATE, 0)) if poses is None else gain @ poses.offsets(one.rows, one.points),
+        _form(one, fit, one.offsets_mm - design @ solution @ one.offsets_mm, axis)
+        if datum.feature == "plane" and one.by_radius is None
+        else None,
+    )
+
+
+def component_feature(
+    component: Component, point: Array, axis: Array, together: CombinedMove, poses: PosePropagation | None
+) -> MeasuredFeature:
+    """A whole component as a feature, at its stated point (3,)."""
+    move = together.at(point)
+    covariance, state = np.zeros((STATE, STATE)), np.zeros(STATE)
+    covariance[:6, :6] = np.sum([*move.covariances.values(), move.disagreement], axis=0)
+    state[:6] = move.twist
+    free = move.undetermined / np.array([move.radius_mm] * 3 + [1.0] * 3)
+    by_poses = np.zeros((STATE, 0))
+    if poses is not None:
+        by_poses = np.concatenate([twist := poses.twist(component, point), np.zeros((1, twist.shape[1]))])
+    return MeasuredFeature(
+        component.name, "fit", point, axis, point[None], 0.0, state, covariance,
+        np.concatenate([free, np.zeros((len(free), 1))], axis=1), by_poses,
+    )  # fmt: skip
+
+
+def joint_state(
+    features: Sequence[MeasuredFeature], alignment: Alignment, poses: PosePropagation | None
+) -> tuple[Array, Array]:
+    """State (7F,) of some features in the datum frame and its covariance (7F,7F), with errors that they share."""
+    frames = []
+    for one in features:
+        by_scale = np.zeros((1, 7))
+        by_scale[0, 6] = one.radius_mm
+        frames.append(np.concatenate([alignment.twist_from_move(one.center), by_scale]))
+    frame = np.concatenate(frames)
+    state = np.concatenate([one.state for one in features]) - frame @ alignment.move
+    covariance = frame @ alignment.covariance @ frame.T
+    for index, one in enumerate(features):
+        own = slice(STATE * index, STATE * (index + 1))
+        covariance[own, own] += one.covariance
+    if poses is not None:
+        by_poses = np.concatenate([one.by_poses for one in features]) - frame @ poses.frame
+        covariance = covariance + by_poses @ poses.covariance @ by_poses.T
+    return state, covariance
+
+
+def _places(datum: Datum, component: Component, center: Array) -> Array:
+    """(V,3) points between which a feature extends: corners of a face, ends of an axis or edge."""
+    if datum.feature == "plane":
+        faces = component.faces[flat_faces(component, datum)]
+        return component.vertices_in_model[np.unique(faces)]
+    if datum.feature == "edge":
+        line = edge_line(component, datum)
+        return np.stack([line.start, line.end])
+    if datum.feature == "cylinder":
+        vertices = component.vertices_in_model[np.unique(component.faces[round_faces(component, datum)[0]])]
+        along = (vertices - center) @ np.array(datum.direction_in_model)
+        return center + np.outer([along.min(), along.max()], datum.direction_in_model)
+    return center[None]
+
+
+def _form(one: DatumEquations, fit: DatumFit, residuals: Array, normal: Array) -> FlatForm | None:
+    """Means of the residuals (N,) of a plane over cells of its surface; None where there are too few for a form."""
+    inlying = fit.inliers
+    places = one.points @ orthogonal_complement(normal[None]).T
+    low, size = places.min(axis=0), np.maximum(np.ptp(places, axis=0), 1e-9)
+    cells = np.minimum((CELLS * (places - low) / size).astype(int), CELLS - 1)
+    keys = np.where(inlying, cells[:, 0] * CELLS + cells[:, 1], -1)
+    weights = np.where(inlying, 1.0 / fit.variances, 0.0)
+    kept: list[NDArray[np.bool_]] = [keys == key for key in np.unique(keys[keys >= 0])]
+    kept = [of for of in kept if np.count_nonzero(of) >= MIN_CELL_POINTS]
+    if len(kept) < CELLS:
+        return None
+    sums = np.array([weights[of].sum() for of in kept])
+    means = np.array([(weights[of] * residuals[of]).sum() for of in kept]) / sums
+    middles = np.stack([np.average(one.points[of], axis=0, weights=weights[of]) for of in kept])
+    return FlatForm(middles, means, 1.0 / sums)
