@@ -314,7 +314,7 @@ def test_inspection_of_another_model_or_version(room: Path) -> None:
     save_inspection(made, room / "good.json")
     text = (room / "good.json").read_text()
     (room / "other.json").write_text(text.replace(model.source_hash, "0" * 64))
-    (room / "newer.json").write_text(text.replace('"1.2"', '"9.0"'))
+    (room / "newer.json").write_text(text.replace('"1.3"', '"9.0"'))
     arguments = ("annotate", "clip.mp4", *ANNOTATE, "--poses", "poses.jsonl", "--inspection")
     assert run(*arguments, "good.json").exit_code == 0
     refused(run(*arguments, "other.json"), "other.json", "another model")

@@ -171,14 +171,8 @@ def feature_scene(seed: int = 0, columns: int = 5, rows: int = 4) -> FeatureScen
         sides = [f"face_{side}_{index}" for side in pair]
         for side, name, sign in zip(pair, sides, (1.0, -1.0), strict=True):
             at_x = x - 0.5 * gap if sign > 0 else x + 0.5 * gap
-            features.append(Datum(name, "edge", f"{side}_{index}", (float(at_x), float(y), height), (0.0, 1.0, 0.0)))
-        across = Characteristic(
-            f"gap_{index}",
-            "distance",
-            tuple(sides),
-            limits_mm=(gap - 0.3, gap + 0.3),
-            direction_in_model=(1.0, 0.0, 0.0),
-        )
+            features.append(Datum(name, "plane", f"{side}_{index}", (float(at_x), float(y), 5.0), (sign, 0.0, 0.0)))
+        across = Characteristic(f"gap_{index}", "gap", tuple(sides), limits_mm=(gap - 0.3, gap + 0.3))
         require(across, gap + opening)
         tilted = Characteristic(f"top_{index} parallelism", "parallelism", (names[1],), 0.2, datums=("A",))
         require(tilted, 2.0 * half * abs(float(np.sin(np.deg2rad(tilt_deg)))))

@@ -135,7 +135,7 @@ def test_a_full_record_comes_back_as_it_was(model: Model, tmp_path: Path) -> Non
     save_inspection(inspection, tmp_path / "inspection.json")
     assert load_inspection(tmp_path / "inspection.json", model) == inspection
     content = json.loads((tmp_path / "inspection.json").read_text(encoding="utf-8"))
-    assert content["schema_version"] == "1.2"
+    assert content["schema_version"] == "1.3"
     assert content["components"][0]["details"]["budget"][0] == {"name": "scale", "std_mm": 0.02}
     assert "reason" not in content["components"][0]["details"]["methods"][0]  # defaults are left out
 

@@ -89,7 +89,7 @@ def _read(table: TomlTable, targets: Mapping[str, DatumFeature], datums: Mapping
         of,
         tolerance_mm=tolerance_mm,
         limits_mm=(low, high),
-        zone=cast(ZoneShape, zone),
+        zone=zone,
         direction_in_model=direction,
         datums=labels,
         is_at_maximum=is_at_maximum,

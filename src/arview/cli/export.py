@@ -18,7 +18,7 @@ from arview.quality import decisions
 
 PLUG_INS = "arview.exports"
 """Entry points of other packages, named as --to names them."""
-FORMATS = ("csv", "qif", "dfq", "glb", "html", "pdf", "decisions")
+FORMATS = ("csv", "characteristics", "qif", "dfq", "glb", "html", "pdf", "decisions")
 
 
 def _parse_formats(ctx: click.Context, parameter: click.Parameter, value: str) -> tuple[str, ...]:
@@ -39,10 +39,12 @@ Examples:
 
 \b
 csv   one line per component, with the latest decision of a person about it
-qif   QIF 3.0 results (ISO 23952): position with spherical zone, x y z, rotation and presence, with
-      standard uncertainties
-dfq   Q-DAS ASCII transfer format (AQDEF): distance, dx, dy, dz, tilt and presence of each component as
-      characteristics; a missing component is an attribute with one error
+characteristics
+      CSV with one line per characteristic of the drawing
+qif   QIF 3.0 results (ISO 23952): position with spherical zone, x y z, rotation and presence, and the
+      characteristics of the drawing, with standard uncertainties
+dfq   Q-DAS ASCII transfer format (AQDEF): distance, dx, dy, dz, tilt and presence of each component, and
+      those of the drawing; a missing component is an attribute with one error
 glb   glTF 2.0: components at nominal and measured place, coloured by verdict, with arrows; needs --part
 html  the report, as `arview report` writes it
 pdf   the report as PDF
@@ -62,7 +64,7 @@ src/arview/inspection/schema/inspection-json.md and by the JSON Schema next to i
     callback=_parse_formats,
     required=True,
     metavar="LIST",
-    help="csv, qif, dfq, glb, html, pdf, decisions, separated by commas.",
+    help="csv, characteristics, qif, dfq, glb, html, pdf, decisions, separated by commas.",
 )
 @click.option("-o", "--output", metavar="FILE|FOLDER", help="File to write, or folder; default: next to INSPECTION.")
 @click.option("--part", "part_path", metavar="PART", help="Part file or CAD file, for glb, html and pdf.")
@@ -98,6 +100,7 @@ def export(
         say(line)
     made: dict[str, Callable[[], bytes]] = {
         "csv": lambda: to_csv(loaded, sha256, decisions.decided_cells(content.entries)).encode("utf-8"),
+        "characteristics": lambda: to_csv(loaded, sha256, of="characteristics").encode("utf-8"),
         "decisions": lambda: decisions.decisions_csv(content.entries, loaded.part, loaded.serial).encode("utf-8"),
         "qif": lambda: to_qif(loaded, sha256),
         "dfq": lambda: to_dfq(loaded, sha256),
@@ -135,6 +138,8 @@ def _targets(source: Path, formats: tuple[str, ...], output: str | None, part_pa
         except OSError as error:
             raise OutputError(f"{output}: the folder cannot be made ({error.strerror})") from error
     names = {name: f"{source.stem}.{name}" for name in formats}
+    if "characteristics" in names:
+        names["characteristics"] = f"{source.stem}.characteristics.csv"
     if "decisions" in names:
         names["decisions"] = decisions.log_of(source).path.with_suffix(".csv").name
     return {name: output_path(str(folder / file), inputs) for name, file in names.items()}

@@ -144,6 +144,8 @@ def measure(
 
 def _print(inspection: Inspection, target: Path) -> None:
     """Print datums, a line for each component, and a summary; warnings go to stderr."""
+    from arview.inspection import verdict_sentence
+
     for warning in inspection.warnings:
         say(f"warning: {warning}")
     system = inspection.datum_system
@@ -169,14 +171,7 @@ def _print(inspection: Inspection, target: Path) -> None:
             f"distances of the cloud to the CAD: {whole.count} points, mean {whole.mean_mm:+.3f}, sigma "
             f"{whole.sigma_mm:.3f}, FWHM {whole.fwhm_mm:.3f} mm"
         )
-    counts = [
-        f"{sum(c.verdict.value == v for c in inspection.components)} {v.replace('_', ' ')}"
-        for v in ("pass", "fail", "undecided", "measured", "not_measured")
-    ]
-    missing = [c.name for c in inspection.components if c.finding is not None]
-    if inspection.foreign_objects:
-        counts.append(f"{len(inspection.foreign_objects)} foreign")
-    click.echo(", ".join(counts) + (f"; missing: {', '.join(missing)}" if missing else ""))
+    click.echo(verdict_sentence(inspection))
     click.echo(f"wrote {target}")
     if inspection.distance_map is not None and inspection.distance_map.files:
         cloud, *pictures = inspection.distance_map.files
@@ -192,6 +187,10 @@ def print_components(inspection: Inspection) -> None:
     )
     for component in inspection.components:
         click.echo(f"{component.name:{width}}{_row(component)}")
+    for one in inspection.characteristics:
+        u = "" if one.uncertainty_mm is None else f", U {one.uncertainty_mm:.3f}"
+        text = f"{one.name}: {one.value_text} of {one.allowed_text} mm{u}, {one.verdict.value.replace('_', ' ')}"
+        click.echo(f"{text}: {one.reason}" if one.reason else text)
 
 
 def _row(component: ComponentDeviation) -> str:

@@ -21,10 +21,13 @@ from arview.inspection.details import (
     Repeatability,
     to_json,
 )
+from arview.inspection.rounding import decimals_beside_limit, exact, fixed
 
 SCHEMA_VERSION = "1.3"
 READABLE_VERSIONS = ("1.0", "1.1", "1.2", "1.3")
 
+ZONE_SIGN = {"diameter": "⌀", "sphere": "S⌀", "width": ""}
+"""What stands before the size of a zone on a drawing (ISO 1101)."""
 _COLUMNS = ("distance_mm", "uncertainty_mm", "tolerance_mm", "tilt_deg", "twist_deg")
 _DISTANCE_SLACK_MM = 0.006
 """Tolerated difference between distance and displacement, which may both be rounded to 0.01 mm in a file."""
@@ -237,6 +240,7 @@ class CharacteristicResult:
             was not measured.
         uncertainty_mm: expanded uncertainty U (k = 2) of ``value_mm``, with that of the bonus.
         zone_mm: diameter or width that was allowed, bonus included; None for kinds with limits.
+        zone: shape of the zone: diameter (of a cylinder), sphere, or width (between two planes).
         bonus_mm: share of ``zone_mm`` by which the feature is off maximum material.
         limits_mm: smallest and largest value allowed; None: not limited.
         nominal_mm: value of the design, of kinds with limits.
@@ -254,6 +258,7 @@ class CharacteristicResult:
     value_mm: float | None = None
     uncertainty_mm: float | None = None
     zone_mm: float | None = None
+    zone: str = "width"
     bonus_mm: float = 0.0
     limits_mm: tuple[float | None, ...] = (None, None)
     nominal_mm: float | None = None
@@ -264,14 +269,37 @@ class CharacteristicResult:
     source: str = ""
 
     @property
-    def excess_mm(self) -> float | None:
-        """By how much the value is beyond its zone or limits, negative within; None if it was not measured."""
+    def range_mm(self) -> tuple[float | None, float | None]:
+        """Smallest and largest value allowed; None: not limited."""
+        low, high = self.limits_mm
+        return (low, high) if self.zone_mm is None else (None, self.zone_mm)
+
+    @property
+    def excess_mm(self) -> float:
+        """By how much the value is beyond its zone or limits, negative within; infinite if it was not measured."""
+        low, high = self.range_mm
+        value = math.inf if self.value_mm is None else self.value_mm
+        return max(-math.inf if low is None else low - value, -math.inf if high is None else value - high)
+
+    @property
+    def value_text(self) -> str:
+        """The value with its unit and the decimals that U allows, and enough to be on the right side of its limit."""
         if self.value_mm is None:
-            return None
-        low, high = self.limits_mm if self.zone_mm is None else (None, self.zone_mm)
-        over = [low - self.value_mm] if low is not None else []
-        over += [self.value_mm - high] if high is not None else []
-        return max(over)
+            return "not measured"
+        limits = [limit for limit in self.range_mm if limit is not None]
+        near = min(limits, key=lambda limit: abs(limit - (self.value_mm or 0.0)), default=None)
+        decimals = decimals_beside_limit(self.value_mm, self.uncertainty_mm, near)
+        return f"{ZONE_SIGN[self.zone] if self.zone_mm is not None else ''}{fixed(self.value_mm, decimals)}"
+
+    @property
+    def allowed_text(self) -> str:
+        """The zone or the limits: ``⌀0.5``, ``11.9 to 12.1``, ``≥ 11.9``."""
+        low, high = self.range_mm
+        if self.zone_mm is not None:
+            return f"{ZONE_SIGN[self.zone]}{exact(self.zone_mm)}"
+        if low is not None and high is not None:
+            return f"{exact(low)} to {exact(high)}"
+        return f"≥ {exact(low)}" if low is not None else f"≤ {exact(high or 0.0)}"
 
 
 @dataclass(frozen=True)

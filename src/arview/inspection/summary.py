@@ -18,10 +18,11 @@ _WORDS = {
 def overall_verdict(inspection: Inspection) -> Verdict:
     """Verdict of the whole part.
 
-    Fail if one component fails; not measured if none was measured; undecided if a component is undecided or was not
-    measured, or if there are foreign objects; measured if none has a tolerance; otherwise pass.
+    Fail if a component or characteristic fails; not measured if nothing was measured; undecided if one of them is
+    undecided or was not measured, or if there are foreign objects; measured if none has a tolerance; otherwise pass.
     """
     verdicts = {component.verdict for component in inspection.components}
+    verdicts |= {one.verdict for one in inspection.characteristics}
     if Verdict.FAIL in verdicts:
         return Verdict.FAIL
     if not verdicts or verdicts == {Verdict.NOT_MEASURED}:
@@ -42,4 +43,9 @@ def verdict_sentence(inspection: Inspection) -> str:
         parts.insert(0, f"{missing} missing")
     if inspection.foreign_objects:
         parts.append(f"{len(inspection.foreign_objects)} foreign object{'s' * (len(inspection.foreign_objects) > 1)}")
-    return f"{total} component{'s' * (total != 1)}: {', '.join(parts)}" if parts else "no components"
+    sentence = f"{total} component{'s' * (total != 1)}: {', '.join(parts)}" if parts else "no components"
+    judged = Counter(one.verdict for one in inspection.characteristics)
+    if not judged:
+        return sentence
+    count, words = judged.total(), ", ".join(f"{judged[key]} {word}" for key, word in _WORDS.items() if judged[key])
+    return f"{sentence}; {count} characteristic{'s' * (count != 1)}: {words}"

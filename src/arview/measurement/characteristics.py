@@ -7,6 +7,7 @@ size (ISO 2692). Only a measured size gives a bonus.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -32,6 +33,11 @@ ORIENTATIONS = ("perpendicularity", "parallelism", "angularity")
 ALONG_AXIS = ("hole", "pin", "cylinder")
 FORM_NOTE = "the form of the surface between its edges is not in the value"
 MEANS_NOTE = "of the means of {count} cells of the surface: shorter waves are not in the value"
+
+
+OF_WHOLE_NOTE = "{component} as a whole was measured: its shape is taken to be that of the CAD"
+MeasureFeature = Callable[[Datum], tuple[Sequence[DatumEquations], str]]
+"""Measures the offsets of a feature, by one or two methods, and has a note about it or an empty text."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +75,7 @@ class Frames:
 
 def measure_characteristics(
     part: Part,
-    measure_one: Callable[[Datum], DatumEquations],
+    measure_one: MeasureFeature,
     results: Mapping[str, ComponentMeasurement],
     measurands: Mapping[str, Measurand],
     frames: Frames,
@@ -81,7 +87,7 @@ def measure_characteristics(
 
     Args:
         part: the part.
-        measure_one: measures the offsets of a feature.
+        measure_one: measures a feature.
         results: of the components.
         measurands: stated points of the components.
         frames: see `Frames`.
@@ -98,16 +104,17 @@ def measure_characteristics(
             if name in datums:
                 datum = datums[name]
                 component, px_mm = part.model.component(datum.component), mm_per_px(np.array(datum.point_in_model))
-                features[name] = feature_of(datum, component, measure_one(datum), frames.poses, px_mm)
+                ways, note = measure_one(datum)
+                features[name] = replace(feature_of(datum, component, ways, frames.poses, px_mm), note=note)
             else:
                 features[name] = _component(name, part, results, measurands, frames.poses)
         except InputError as error:
             features[name] = str(error).removeprefix("datum ")
-    judge = _Judge(part, features, frames, guard)
+    decisions = _Decisions(part, features, frames, guard)
     found: list[CharacteristicResult] = []
     # A bonus needs the sizes first.
     for one in sorted(part.characteristics, key=lambda one: one.kind not in WITH_LIMITS):
-        found.append(judge.result(one))
+        found.append(decisions.result(one))
     order = {one.name: index for index, one in enumerate(part.characteristics)}
     return tuple(sorted(found, key=lambda one: order[one.name]))
 
@@ -127,7 +134,7 @@ def _component(
     return component_feature(part.model.component(name), measurand.point_in_model, measurand.axes[2], together, poses)
 
 
-class _Judge:
+class _Decisions:
     """Judges the characteristics of one part from its measured features; sizes are remembered for the bonus."""
 
     def __init__(self, part: Part, features: Mapping[str, MeasuredFeature | str], frames: Frames, guard: float) -> None:
@@ -139,13 +146,21 @@ class _Judge:
         """The result of one characteristic."""
         marked = tuple(f"{label}(M)" if label in one.datums_at_maximum else label for label in one.datums)
         empty = CharacteristicResult(
-            one.name, one.kind, one.of, Verdict.NOT_MEASURED, zone_mm=one.tolerance_mm, limits_mm=one.limits_mm,
-            datums=marked, source=one.source,
-        )  # fmt: skip
+            one.name,
+            one.kind,
+            one.of,
+            Verdict.NOT_MEASURED,
+            zone_mm=one.tolerance_mm,
+            zone=one.zone,
+            limits_mm=one.limits_mm,
+            datums=marked,
+            source=one.source,
+        )
         try:
             features = [self._feature(name) for name in one.of]
-            x, y, z = (float(v) for v in np.mean([feature.center for feature in features], axis=0))
-            empty = replace(empty, point_mm=(x, y, z))
+            x, y, z = (float(v) for v in np.mean([feature.center for feature in features], axis=0).tolist())
+            noted = tuple(dict.fromkeys(feature.note for feature in features if feature.note))
+            empty = replace(empty, point_mm=(x, y, z), notes=noted)
             return self._limited(one, features, empty) if one.kind in WITH_LIMITS else self._zone(one, features, empty)
         except InputError as error:
             return replace(empty, reason=str(error))
@@ -164,7 +179,7 @@ class _Judge:
         state, covariance = joint_state(features, self.frames.whole, self.frames.poses)
         _check_determined(Zone(row[None, None], np.zeros((1, 1, 0)), np.zeros(0)), features)
         value = nominal + float(row @ state)
-        uncertainty = K * float(np.sqrt(max(0.0, row @ covariance @ row)))
+        uncertainty = K * math.sqrt(max(0.0, float(row @ covariance @ row)))
         if one.kind == "size":
             low, high = one.limits_mm
             is_hole = self._is_hole(one.of[0])
@@ -188,13 +203,12 @@ class _Judge:
         """A characteristic with a tolerance zone."""
         alignment, poses = self.frames.of(one.datums)
         state, covariance = joint_state(features, alignment, poses)
-        notes: tuple[str, ...] = ()
         zone = _zone_of(one, features, self._free_motions(one, alignment), alignment.origin_in_model)
         form = features[0].form
         if one.kind in ("profile", "flatness"):
-            notes = (FORM_NOTE,)
+            note = FORM_NOTE if form is None else MEANS_NOTE.format(count=len(form.points))
+            empty = replace(empty, notes=(*empty.notes, note))
             if form is not None:
-                notes = (MEANS_NOTE.format(count=len(form.points)),)
                 state = np.concatenate([state, form.offsets_mm])
                 covariance = np.block([
                     [covariance, np.zeros((len(covariance), len(form.variances)))],
@@ -206,14 +220,13 @@ class _Judge:
         value, uncertainty = with_uncertainty(zone, state, covariance)
         assert one.tolerance_mm is not None
         bonus, of_bonus = self._bonus(one.of) if one.is_at_maximum else (0.0, 0.0)
-        uncertainty = float(np.hypot(uncertainty, of_bonus))
+        uncertainty = math.hypot(uncertainty, of_bonus)
         allowed = one.tolerance_mm + bonus
         verdict = decide(value, uncertainty, allowed, self.guard)
-        if notes == (FORM_NOTE,) and verdict is Verdict.PASS:
+        if FORM_NOTE in empty.notes and verdict is Verdict.PASS:
             verdict = Verdict.UNDECIDED
         return replace(
             empty, verdict=verdict, value_mm=value, uncertainty_mm=uncertainty, zone_mm=allowed, bonus_mm=bonus,
-            notes=notes,
         )  # fmt: skip
 
     def _bonus(self, names: Sequence[str]) -> tuple[float, float]:

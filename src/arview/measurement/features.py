@@ -8,7 +8,7 @@ noise, and the errors of the camera poses, so that features measured in the same
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,17 +20,26 @@ from arview.measurement.datums.alignment import Alignment, contribution
 from arview.measurement.datums.cad_features import edge_line, flat_faces, round_faces
 from arview.measurement.datums.datum_fit import DatumFit, check_fit_covered, fit_datum
 from arview.measurement.datums.directions import observable_directions, shift_origin
-from arview.measurement.datums.equations import DatumEquations
-from arview.measurement.uncertainty.combine import CombinedMove
+from arview.measurement.datums.equations import DatumEquations, DatumNotMeasuredError, point_from_move
+from arview.measurement.datums.options import REACH_MM
+from arview.measurement.types import Method, Move
+from arview.measurement.uncertainty.combine import CombinedMove, combine
 from arview.measurement.uncertainty.pose_propagation import PosePropagation
 
+METHODS: tuple[Method, ...] = ("sweep", "edges")
+"""By which the offsets of a flat face may be measured: on its surface, and along its border."""
+ROUND = ("hole", "pin", "cylinder")
 STATE = 7
 """Numbers of a feature's state: twist about its centre in model axes (rad, mm), and the change of its radius, mm."""
 CELLS = 5
 """Cells along each side of a flat face of whose points the means are its form."""
 MIN_CELL_POINTS = 4
 """Points of a cell below which its mean says nothing."""
-RADIUS_PX = 0.06
+MAX_MOVE_MM = 2.0 * REACH_MM
+"""Displacement of any part of a feature beyond which it was matched wrongly: it is searched for within half of that."""
+MIN_SPAN = 0.5
+"""Share of a face's length and width over which it must be measured: a strip in a gap is matched wrongly."""
+RADIUS_PX = 0.03
 """Standard uncertainty of a radius by where along the step of brightness the edge is taken to be, px of the photos."""
 
 
@@ -65,6 +74,7 @@ class MeasuredFeature:
         undetermined: (K,7) states of about a millimetre that the data leave free.
         by_poses: (7,P) derivative by the camera poses.
         form: of a flat face, where its surface was measured.
+        note: what its measurement takes for granted, or empty.
     """
 
     name: str
@@ -78,32 +88,76 @@ class MeasuredFeature:
     undetermined: Array
     by_poses: Array
     form: FlatForm | None = None
+    note: str = ""
 
 
 def feature_of(
-    datum: Datum, component: Component, one: DatumEquations, poses: PosePropagation | None, px_mm: float
+    datum: Datum, component: Component, ways: Sequence[DatumEquations], poses: PosePropagation | None, px_mm: float
 ) -> MeasuredFeature:
     """A feature from its measured offsets.
 
     Args:
         datum: the feature as the part file has it.
         component: that carries it.
-        one: its offsets.
+        ways: its offsets by one or two independent methods, whose results are combined.
         poses: for the errors of the camera poses; None leaves them out.
         px_mm: size of a pixel of the photos there; 0 without photos.
 
     Raises:
         DatumNotMeasuredError: too little of it was found.
     """
+    axis, point = np.array(datum.direction_in_model), np.array(datum.point_in_model)
+    middle = ways[0].points.mean(axis=0)
+    places = _places(datum, component)
+    # A rim is centred on its axis, at the end that is seen; a face or an edge in its own middle.
+    center = point + axis * (axis @ (middle - point)) if datum.feature in ROUND else places.mean(axis=0)
+    reach_mm = max(1.0, float(np.sqrt(np.mean(np.sum((ways[0].points - center) ** 2, axis=1)))))
+    found: list[MeasuredFeature] = []
+    faults: list[DatumNotMeasuredError] = []
+    for one in ways:
+        try:
+            found.append(_solved(datum, component, one, poses, px_mm, center, places, reach_mm))
+        except DatumNotMeasuredError as error:
+            faults.append(error)
+    if not found:
+        raise faults[0]
+    if len(found) == 1:
+        return found[0]
+    moves = [
+        Move(
+            datum.component, method, center, feature.state[:6], feature.covariance[:6, :6],
+            feature.undetermined[:, :6] / _unit(reach_mm), reach_mm, 0, 0.0, 1.0,
+        )
+        for feature, method in zip(found, METHODS, strict=False)
+    ]  # fmt: skip
+    both = component_feature(component, center, axis, combine(moves), None)
+    by_poses = np.mean([feature.by_poses for feature in found], axis=0)
+    return replace(
+        found[0], state=both.state, covariance=both.covariance, undetermined=both.undetermined, by_poses=by_poses
+    )
+
+
+def _unit(reach_mm: float) -> Array:
+    """(6,) what makes rotations of a twist of displacements at a distance."""
+    return np.array([1.0 / reach_mm] * 3 + [1.0] * 3)
+
+
+def _solved(
+    datum: Datum,
+    component: Component,
+    one: DatumEquations,
+    poses: PosePropagation | None,
+    px_mm: float,
+    center: Array,
+    places: Array,
+    reach_mm: float,
+) -> MeasuredFeature:
+    """A feature from its offsets by one method, as `feature_of` has it; it turns about ``center`` (3,)."""
     fit = fit_datum(one, False)
     check_fit_covered(one, fit)
     is_rim, axis = datum.feature in ("hole", "pin"), np.array(datum.direction_in_model)
-    point, middle = np.array(datum.point_in_model), one.points.mean(axis=0)
-    # A rim is centred on its axis, at the end that is seen; a face on itself.
-    center = middle if datum.feature in ("plane", "edge") else point + axis * (axis @ (middle - point))
     rows = one.rows[:, :6] - one.rows[:, 3:6] @ shift_origin(center)[:, :6]
-    reach = max(1.0, float(np.sqrt(np.mean(np.sum((one.points - center) ** 2, axis=1)))))
-    unit = np.array([1.0 / reach] * 3 + [1.0] * 3)
+    unit = _unit(reach_mm)
     allowed = np.eye(6)[:, 3:] if is_rim or datum.feature == "point" else np.eye(6)
     columns = observable_directions(rows * unit, allowed, fit.weights)
     design = rows @ (columns * unit[:, None])
@@ -119,21 +173,28 @@ def feature_of(
     covariance = contribution(gain, one, fit)
     if one.by_radius is not None:
         covariance[6, 6] += (RADIUS_PX * px_mm) ** 2
+    state = gain @ one.offsets_mm
+    across = point_from_move(places - center)[:, :, :6] @ state[:6]
+    in_plane = orthogonal_complement(axis[None]).T
+    spans, extents = np.ptp(one.points[fit.inliers] @ in_plane, axis=0), np.ptp(places @ in_plane, axis=0)
+    is_strip = one.feature == "plane" and bool((spans < MIN_SPAN * extents).any())
+    if is_strip or np.linalg.norm(across, axis=1).max() > MAX_MOVE_MM:
+        raise DatumNotMeasuredError(
+            f"datum {datum.label} ({datum.feature}): what was seen of it does not tell where all of it is"
+        )
     free = orthogonal_complement(columns.T) * unit
     return MeasuredFeature(
         datum.label,
         datum.feature,
         center,
         axis,
-        _places(datum, component, center),
+        places,
         0.5 * (datum.diameter_mm or 0.0),
-        gain @ one.offsets_mm,
+        state,
         covariance,
         np.concatenate([free, np.zeros((len(free), 1))], axis=1),
-        np.zeros((STATE, 0)) if poses is None else gain @ poses.offsets(one.rows, one.points),
-        _form(one, fit, one.offsets_mm - design @ solution @ one.offsets_mm, axis)
-        if datum.feature == "plane" and one.by_radius is None
-        else None,
+        np.zeros((STATE, 0)) if poses is None else gain @ poses.offsets(one.rows, one.points, one.feature == "fit"),
+        _form(one, fit, one.offsets_mm - design @ solution @ one.offsets_mm, axis) if one.feature == "plane" else None,
     )
 
 
@@ -176,7 +237,7 @@ def joint_state(
     return state, covariance
 
 
-def _places(datum: Datum, component: Component, center: Array) -> Array:
+def _places(datum: Datum, component: Component) -> Array:
     """(V,3) points between which a feature extends: corners of a face, ends of an axis or edge."""
     if datum.feature == "plane":
         faces = component.faces[flat_faces(component, datum)]
@@ -184,6 +245,7 @@ def _places(datum: Datum, component: Component, center: Array) -> Array:
     if datum.feature == "edge":
         line = edge_line(component, datum)
         return np.stack([line.start, line.end])
+    center = np.array(datum.point_in_model)
     if datum.feature == "cylinder":
         vertices = component.vertices_in_model[np.unique(component.faces[round_faces(component, datum)[0]])]
         along = (vertices - center) @ np.array(datum.direction_in_model)

@@ -18,14 +18,15 @@ from arview.core.progress import Progress
 from arview.errors import InputError
 from arview.geometry import Array
 from arview.inspection import CharacteristicResult, DistanceReport, FailedDatum, ForeignReport, Inspection
-from arview.measurement.characteristics import Frames, measure_characteristics
+from arview.measurement.characteristics import OF_WHOLE_NOTE, Frames, MeasureFeature, measure_characteristics
 from arview.measurement.cloud_report import inspect_cloud, scatter_doubts
 from arview.measurement.datums.alignment import Alignment, align
 from arview.measurement.datums.datum_fit import check_covered
-from arview.measurement.datums.equations import DatumEquations, move_equations
+from arview.measurement.datums.equations import DatumEquations, DatumNotMeasuredError, move_equations
 from arview.measurement.datums.in_cloud import measure_datums_in_cloud
-from arview.measurement.datums.in_photos import measure_datums_in_photos
+from arview.measurement.datums.in_photos import measure_datums_in_photos, measure_plane_in_photos
 from arview.measurement.datums.partial import MeasureDatum, measure_each
+from arview.measurement.datums.plane_edges import with_form
 from arview.measurement.datums.planes import base_plane
 from arview.measurement.folder import BY_SHAPE, MetricReconstruction, in_model_frame, read_folder
 from arview.measurement.look_alikes import with_unsure_names
@@ -140,10 +141,15 @@ def _measure(
     if part.characteristics:
         rough = _rough_frame(alignment.origin_in_model, size_mm := _size_mm(part.model, base))
         frames = Frames(alignment, rough, size_mm, reconstruction.scale.scale_std or 0.0, poses)
-        measure_one = _datum_measurement(reconstruction, views, part, {})
+        moves = {
+            name: _as_move(name, together)
+            for name in {one.component for one in part.features if one.component in results}
+            if (together := combined_of(results[name])) is not None
+        }
+        measure_feature = _feature_measurement(reconstruction, views, part, moves)
         px_mm = views.mm_per_px if views is not None else lambda point: 0.0
         characteristics = measure_characteristics(
-            part, measure_one, results, measurands, frames, options.decision.guard, px_mm, tell
+            part, measure_feature, results, measurands, frames, options.decision.guard, px_mm, tell
         )
     if BY_SHAPE in warnings:
         deviations, doubts = with_unsure_names(deviations, part)
@@ -284,6 +290,35 @@ def _datum_measurement(
             return measure_datums_in_photos((datum,), views, fitted)[0]
         assert reconstruction.cloud is not None
         return measure_datums_in_cloud((datum,), part.model, reconstruction.cloud, fitted)[0]
+
+    return measure_one
+
+
+def _feature_measurement(
+    reconstruction: MetricReconstruction, views: PhotoViews | None, part: Part, fitted: Mapping[str, Move]
+) -> MeasureFeature:
+    """The function that measures one feature, and what is noted about it.
+
+    A face or an edge that is not seen by itself, as in a narrow gap, is where its component is.
+    """
+    measure_datum = _datum_measurement(reconstruction, views, part, fitted)
+
+    def measure_one(datum: Datum) -> tuple[Sequence[DatumEquations], str]:
+        whole, ways = fitted.get(datum.component), []
+        has_whole = whole is not None and datum.feature in ("plane", "edge")
+        try:
+            if views is not None and datum.feature == "plane":
+                ways = measure_plane_in_photos(datum, views, fitted, is_one_enough=False)
+            else:
+                ways = [measure_datum(datum)]
+        except DatumNotMeasuredError:
+            if not has_whole:
+                raise
+        # The fit of a plane's border is combined with that of its component already.
+        if whole is None or not has_whole or any(one.feature == "fit" for one in ways):
+            return ways, ""
+        note = "" if ways else OF_WHOLE_NOTE.format(component=datum.component)
+        return [*ways, move_equations(datum.label, with_form(whole))[0]], note
 
     return measure_one
 

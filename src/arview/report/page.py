@@ -17,6 +17,7 @@ from arview import measurement, overlay, reconstruction
 from arview.core.progress import Progress
 from arview.geometry import Array
 from arview.inspection import (
+    CharacteristicResult,
     ComponentDeviation,
     Details,
     Inspection,
@@ -92,6 +93,7 @@ def build_context(evidence: ReportEvidence, progress: Progress) -> dict[str, Any
         "uncertainty_lead": explanations.uncertainty(inspection),
     }
     context |= _components(evidence) | _findings(evidence, gallery)
+    context["characteristics"] = [_characteristic(one) for one in _by_excess(inspection)]
     context |= _distance_map(evidence) | _budget(inspection) | _datums(inspection)
     context |= repeatability_context(inspection) | decisions_context(evidence)
     progress("rework", 0, 1)
@@ -197,6 +199,28 @@ def _components(evidence: ReportEvidence) -> dict[str, Any]:
         "rows": rows,
         "components_lead": f"{lead[:1].upper()}{lead[1:]}.",
         "legend": explanations.legend_of(evidence.inspection),
+    }
+
+
+def _by_excess(inspection: Inspection) -> list[CharacteristicResult]:
+    """The characteristics, those that matter most first: failed, not measured, undecided, then by what is left."""
+    order = (Verdict.FAIL, Verdict.NOT_MEASURED, Verdict.UNDECIDED, Verdict.MEASURED, Verdict.PASS)
+    return sorted(inspection.characteristics, key=lambda one: (order.index(one.verdict), -one.excess_mm))
+
+
+def _characteristic(one: CharacteristicResult) -> dict[str, Any]:
+    """A row of the table of characteristics."""
+    return {
+        "name": one.name,
+        "kind": one.kind,
+        "datums": " | ".join(one.datums),
+        "value": one.value_text if one.value_mm is not None else NONE,
+        "uncertainty": number(one.uncertainty_mm, decimals_of(one.uncertainty_mm)),
+        "allowed": one.allowed_text,
+        "bonus": number(one.bonus_mm) if one.bonus_mm else NONE,
+        "remark": "; ".join((*([one.reason] if one.reason else []), *one.notes, one.source)).strip("; "),
+        "verdict": one.verdict.value,
+        "word": VERDICT_WORD[one.verdict],
     }
 
 

@@ -1,10 +1,11 @@
-"""CSV with a line for each component: RFC 4180, decimal point."""
+"""CSV with a line for each component, and another with one for each characteristic: RFC 4180, decimal point."""
 
 from __future__ import annotations
 
 import csv
 import io
 from collections.abc import Mapping
+from typing import Literal
 
 from arview.inspection.details import MEASURANDS
 from arview.inspection.fingerprint import fingerprint
@@ -50,10 +51,20 @@ HEADER = (
 """Columns. Cells of undetermined or unmeasured values are empty."""
 
 
+CHARACTERISTIC_HEADER = (
+    "part", "serial", "measured_utc", "characteristic", "kind", "of", "datums", "verdict", "value_mm", "U_mm", "zone",
+    "zone_mm", "bonus_mm", "min_mm", "max_mm", "nominal_mm", "reason", "notes", "source", "inspection_sha256",
+)  # fmt: skip
+"""Columns of the characteristics."""
+
+
 def to_csv(
-    inspection: Inspection, sha256: str | None = None, decided: Mapping[str, tuple[str, str, str, str]] | None = None
+    inspection: Inspection,
+    sha256: str | None = None,
+    decided: Mapping[str, tuple[str, str, str, str]] | None = None,
+    of: Literal["components", "characteristics"] = "components",
 ) -> str:
-    """The inspection as CSV with the columns of `HEADER`; lines end with CR LF.
+    """The inspection as CSV with the columns of `HEADER`, or of `CHARACTERISTIC_HEADER`; lines end with CR LF.
 
     Measured values are rounded to what their U allows.
 
@@ -61,14 +72,36 @@ def to_csv(
         inspection: the inspection.
         sha256: fingerprint of the file it was read from; default: that of the inspection.
         decided: decision, reason, name and time of people's decisions about components, by their names.
+        of: what there is a line for.
     """
     sha256 = sha256 or fingerprint(inspection)
+    if of == "characteristics":
+        return _characteristics(inspection, sha256)
     out = io.StringIO(newline="")
     writer = csv.writer(out)
     writer.writerow(HEADER)
     for component in inspection.components:
         person = (decided or {}).get(component.name, ("", "", "", ""))
         writer.writerow([_text(cell) for cell in (*_row(inspection, component), sha256, _point(component), *person)])
+    return out.getvalue()
+
+
+def _characteristics(inspection: Inspection, sha256: str) -> str:
+    """The characteristics as CSV with the columns of `CHARACTERISTIC_HEADER`."""
+    head = [inspection.part, inspection.serial, inspection.created.strftime("%Y-%m-%dT%H:%M:%SZ")]
+    out = io.StringIO(newline="")
+    writer = csv.writer(out)
+    writer.writerow(CHARACTERISTIC_HEADER)
+    for one in inspection.characteristics:
+        value = "" if one.value_mm is None else one.value_text.lstrip("S⌀")
+        cells = [*head, one.name, one.kind, ", ".join(one.of), " ".join(one.datums), one.verdict.value, value]
+        cells += [
+            _rounded(one.uncertainty_mm, decimals_of(one.uncertainty_mm)),
+            "" if one.zone_mm is None else one.zone,
+        ]
+        cells += [_exact(number) for number in (one.zone_mm, one.bonus_mm or None, *one.limits_mm, one.nominal_mm)]
+        cells += [one.reason, "; ".join(one.notes), one.source, sha256]
+        writer.writerow([_text(cell) for cell in cells])
     return out.getvalue()
 
 

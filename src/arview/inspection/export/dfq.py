@@ -2,6 +2,7 @@
 
 The characteristics of each component are its distance from the design position (one-sided with natural limit 0), dx,
 dy, dz, the tilt, and its presence: an attribute with one error for a missing component and none for one that is there.
+The characteristics of the drawing follow with both limits.
 The characteristic of an undetermined value has no value, nor has the presence of a component that was not measured.
 """
 
@@ -10,7 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from arview.inspection.fingerprint import fingerprint
-from arview.inspection.record import ComponentDeviation, Inspection
+from arview.inspection.record import CharacteristicResult, ComponentDeviation, Inspection
 from arview.inspection.rounding import decimals_beside_limit, decimals_of, exact, fixed
 
 _LIMIT, _NATURAL_LIMIT = "1", "2"
@@ -33,6 +34,7 @@ class _Characteristic:
     remark: str = ""
     is_present: bool | None = None
     is_attribute: bool = False
+    lower: float | None = None
 
 
 def to_dfq(inspection: Inspection, sha256: str | None = None) -> bytes:
@@ -46,6 +48,7 @@ def to_dfq(inspection: Inspection, sha256: str | None = None) -> bytes:
     """
     sha256 = sha256 or fingerprint(inspection)
     rows = [row for component in inspection.components for row in _characteristics(component)]
+    rows += [_of_drawing(one) for one in inspection.characteristics]
     source = inspection.provenance
     fields: list[tuple[str, str]] = [
         ("K0100", str(len(rows))),
@@ -114,6 +117,17 @@ def _characteristics(one: ComponentDeviation) -> list[_Characteristic]:
     ]
 
 
+def _of_drawing(one: CharacteristicResult) -> _Characteristic:
+    """A characteristic of the drawing; the size of a zone cannot be below 0."""
+    decimals = decimals_of(one.uncertainty_mm)
+    u = "" if one.uncertainty_mm is None else f"U = {fixed(one.uncertainty_mm, decimals)} mm; "
+    lower, upper = one.range_mm
+    return _Characteristic(
+        one.name, f"{one.kind} of {', '.join(one.of)}", "mm", decimals, upper, one.zone_mm is not None, one.value_mm,
+        u + one.verdict.value, lower=lower,
+    )  # fmt: skip
+
+
 def _value(index: int, row: _Characteristic) -> list[tuple[str, str]]:
     """The fields of a value: a number, or for an attribute the sample size and the number of errors in it."""
     if row.is_attribute:
@@ -124,7 +138,7 @@ def _value(index: int, row: _Characteristic) -> list[tuple[str, str]]:
 
 
 def _description(index: int, row: _Characteristic) -> list[tuple[str, str]]:
-    has_limit = row.upper is not None or row.is_attribute
+    has_limit = row.upper is not None or row.lower is not None or row.is_attribute
     fields = [
         ("K2001", row.number),
         ("K2002", row.description),
@@ -135,6 +149,8 @@ def _description(index: int, row: _Characteristic) -> list[tuple[str, str]]:
         fields += [("K2022", str(row.decimals)), ("K2101", "0")]
         if row.is_length_from_zero:
             fields += [("K2110", "0"), ("K2120", _NATURAL_LIMIT)]
+        if row.lower is not None:
+            fields += [("K2110", exact(row.lower)), ("K2120", _LIMIT)]
         if row.upper is not None:
             fields += [("K2111", exact(row.upper)), ("K2121", _LIMIT)]
         fields.append(("K2142", row.unit))

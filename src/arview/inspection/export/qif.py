@@ -15,7 +15,7 @@ from typing import Any
 from lxml import etree
 
 from arview.inspection.fingerprint import fingerprint
-from arview.inspection.record import ComponentDeviation, Finding, Inspection, Verdict
+from arview.inspection.record import CharacteristicResult, ComponentDeviation, Finding, Inspection, Verdict
 from arview.inspection.rounding import decimals_beside_limit, decimals_of, exact, fixed
 from arview.inspection.summary import overall_verdict
 
@@ -28,6 +28,19 @@ _STATUS = {
     Verdict.MEASURED: "NOT_ANALYZED",
     Verdict.NOT_MEASURED: "NOT_ANALYZED",
 }
+_KINDS = {
+    "position": "Position",
+    "profile": "SurfaceProfile",
+    "flatness": "Flatness",
+    "perpendicularity": "Perpendicularity",
+    "parallelism": "Parallelism",
+    "angularity": "Angularity",
+    "size": "Diameter",
+    "distance": "UserDefinedLinear",
+    "gap": "UserDefinedLinear",
+    "flush": "UserDefinedLinear",
+}
+"""Elements of the characteristics of the drawing."""
 _INSPECTION_STATUS = {
     Verdict.PASS: "PASS",
     Verdict.FAIL: "FAIL",
@@ -69,6 +82,8 @@ class _Document:
         self.actual_id = self._next_id()
         for component in inspection.components:
             self._add(component)
+        for one in inspection.characteristics:
+            self._add_of_drawing(one)
 
     def encoded(self) -> bytes:
         """The complete document as UTF-8."""
@@ -142,6 +157,32 @@ class _Document:
         self._add_coordinates(one)
         self._add_angle(one)
         self._add_presence(one)
+
+    def _add_of_drawing(self, one: CharacteristicResult) -> None:
+        """A characteristic of the drawing, with a definition of its own."""
+        kind = _KINDS[one.kind]
+        number, definition = self._definition(kind)
+        if one.zone_mm is None:
+            limits, tags = one.limits_mm[::-1], ("MaxValue", "MinValue")
+            tolerance = _add(definition, "Tolerance")
+            for tag, limit in zip(tags, limits, strict=True):
+                if limit is not None:
+                    _add(tolerance, tag, exact(limit))
+            _add(tolerance, "DefinedAsLimit", "true")
+            if kind == "UserDefinedLinear":
+                _add(definition, "WhatToMeasure", f"{one.kind} of {' and '.join(one.of)}")
+        else:
+            _add(definition, "ToleranceValue", exact(one.zone_mm - one.bonus_mm))
+            if kind not in ("Flatness", "SurfaceProfile"):
+                _add(definition, "MaterialCondition", "MAXIMUM" if one.bonus_mm else "NONE")
+                planes = "NonDiametricalZone" if kind == "Position" else "PlanarZone"
+                shapes = {"sphere": "SphericalZone", "diameter": "DiametricalZone", "width": planes}
+                _add(_add(definition, "ZoneShape"), shapes[one.zone])
+        target = [("TargetValue", exact(one.nominal_mm))] if one.nominal_mm is not None else []
+        item = self._item(kind, ", ".join(one.of), one.name, number, target)
+        std = None if one.uncertainty_mm is None else one.uncertainty_mm / 2.0
+        text = None if one.value_mm is None else one.value_text.lstrip("S⌀")
+        self._measurement(kind, item, _STATUS[one.verdict], text, std)
 
     def _add_coordinates(self, one: ComponentDeviation) -> None:
         if not self._coordinates:

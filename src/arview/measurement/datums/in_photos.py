@@ -73,19 +73,40 @@ def _measure(datum: Datum, views: PhotoViews, moves: Mapping[str, Move]) -> Datu
         return _measure_cylinder(datum, views)
     if datum.feature == "edge":
         return _measure_edge(datum, views)
-    try:
-        by_surface = _measure_flat(datum, views)
-        if datum.feature == "plane":
-            check_covered(by_surface)
-        return by_surface
-    except DatumNotMeasuredError as error:
-        if datum.feature != "plane":
-            raise
+    if datum.feature == "point":
+        return _measure_flat(datum, views)
+    return measure_plane_in_photos(datum, views, moves, is_one_enough=True)[0]
+
+
+def measure_plane_in_photos(
+    datum: Datum, views: PhotoViews, moves: Mapping[str, Move], is_one_enough: bool
+) -> list[DatumEquations]:
+    """Offsets of a plane by its surface and by its edges; with ``is_one_enough`` by edges only if need be.
+
+    The surface of a large face tells more than its edges, and has a form; that of a small one without texture little.
+
+    Raises:
+        DatumNotMeasuredError: neither shows it.
+    """
+    ways: tuple[Callable[[], DatumEquations], ...] = (
+        lambda: _measure_flat(datum, views),
+        lambda: measure_plane_by_edges(datum, views, moves.get(datum.component)),
+    )
+    found: list[DatumEquations] = []
+    faults: list[DatumNotMeasuredError] = []
+    for way in ways:
         try:
-            return measure_plane_by_edges(datum, views, moves.get(datum.component))
-        except DatumNotMeasuredError as by_edges:
-            reason = str(by_edges).removeprefix(f"datum {datum.label} ({datum.feature}): ")
-            raise DatumNotMeasuredError(f"{error}; nor by its edges: {reason}") from by_edges
+            equations = way()
+            check_covered(equations)
+            found.append(equations)
+        except DatumNotMeasuredError as error:
+            faults.append(error)
+        if found and is_one_enough:
+            break
+    if not found:
+        reason = str(faults[1]).removeprefix(f"datum {datum.label} ({datum.feature}): ")
+        raise DatumNotMeasuredError(f"{faults[0]}; nor by its edges: {reason}") from faults[1]
+    return found
 
 
 def _measure_flat(datum: Datum, views: PhotoViews) -> DatumEquations:

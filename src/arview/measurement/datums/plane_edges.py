@@ -64,8 +64,7 @@ def measure_plane_by_edges(datum: Datum, views: PhotoViews, whole: Move | None =
     _check_seen(datum, edges)
     moves = []
     if whole is not None and not _is_open(whole, directions):
-        form = np.diag(np.repeat([whole.radius_mm, 1.0], 3) ** -2.0) * PLANE_FORM_MM**2
-        moves = [replace(whole, covariance=whole.covariance + form).at(edges.points.mean(axis=0))]
+        moves = [with_form(whole).at(edges.points.mean(axis=0))]
     try:
         moves.append(_by_own_edges(datum, edges.of(is_clear), views))
     except DatumNotMeasuredError:
@@ -85,6 +84,12 @@ def measure_plane_by_edges(datum: Datum, views: PhotoViews, whole: Move | None =
         locks=datum.locks,
         directions=directions,
     )
+
+
+def with_form(whole: Move) -> Move:
+    """The move of a component with the uncertainty that a face of it has by its form."""
+    form = np.diag(np.repeat([whole.radius_mm, 1.0], 3) ** -2.0) * PLANE_FORM_MM**2
+    return replace(whole, covariance=whole.covariance + form)
 
 
 def _check_seen(datum: Datum, edges: EdgePoints) -> None:
