@@ -177,6 +177,36 @@ BAD = [
         '[datums.A]\nfeature = "hole"\ncomponent = "post_1"\npoint_mm = [0, 0, 0]\naxis = [0, 0, 1]\n',
         "diameter_mm",
     ),
+    ('[[characteristics]]\nkind = "place"\n', 'kind = .place.: expected one of "position"'),
+    ('[[characteristics]]\nkind = "position"\nof = "bore"\n', "of = 'bore': expected features or components, of base_"),
+    (
+        '[[characteristics]]\nkind = "size"\nof = "post_1"\nmax_mm = 3\n',
+        r"of = \['post_1'\]: expected a round feature",
+    ),
+    ('[[characteristics]]\nkind = "gap"\nof = ["post_1", "post_2"]\nmin_mm = 3\n', "expected flat faces"),
+    ('[[characteristics]]\nkind = "distance"\nof = "post_1"\nmin_mm = 3\n', "expected two names"),
+    ('[[characteristics]]\nkind = "distance"\nof = ["post_1", "post_2"]\n', "expected min_mm below max_mm, or one"),
+    (
+        '[[characteristics]]\nkind = "distance"\nof = ["post_1", "post_2"]\nmin_mm = 3\nmax_mm = 2\n',
+        "min_mm = 3.0: expected min_mm below max_mm",
+    ),
+    ('[[characteristics]]\nkind = "position"\nof = "post_1"\n', "'tolerance_mm' is missing"),
+    (
+        '[[characteristics]]\nkind = "position"\nof = "post_1"\ntolerance_mm = 1\ndatums = ["A"]\n',
+        "datums = 'A': expected datums of the part",
+    ),
+    (
+        '[[characteristics]]\nkind = "position"\nof = "post_1"\ntolerance_mm = 1\nzone = "width"\n',
+        "a direction across the zone",
+    ),
+    (
+        '[[characteristics]]\nkind = "position"\nof = "post_1"\ntolerance_mm = 1\nat_maximum_material = true\n',
+        "maximum material needs the limits of the size of post_1",
+    ),
+    (
+        '[[characteristics]]\nkind = "position"\nof = "post_1"\ntolerance_mm = 1\ntolerance = 2\n',
+        "unknown key 'tolerance' .did you mean 'tolerance_mm'",
+    ),
     ('[defaults]\nrole = "ignore"\n', "every component has the role 'ignore'"),
     ("[components\n", "not valid TOML"),
 ]

@@ -367,7 +367,7 @@ def test_the_command(tmp_path: Path, found: Inspection) -> None:
     assert (tmp_path / "inspection.csv").read_bytes() == to_csv(found).encode()
     for arguments, message in (
         (["--to", "glb"], "--part"),
-        (["--to", "xls"], "expected some of csv,qif,dfq,glb,html,pdf"),
+        (["--to", "xls"], "expected some of csv,characteristics,qif,dfq,glb,html,pdf"),
         (["--to", "csv,qif", "-o", str(tmp_path / "one.csv")], "2 formats need a folder"),
         (["--to", "csv", "-o", str(source)], "would overwrite an input"),
     ):

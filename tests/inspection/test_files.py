@@ -134,7 +134,7 @@ def _set(path: str, value: Any) -> Callable[[dict[str, Any]], None]:
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        (_set("schema_version", "1.3"), "written by a newer arview"),
+        (_set("schema_version", "1.4"), "written by a newer arview"),
         (_set("schema_version", "2.0"), "written by a newer arview"),
         (_set("schema_version", "0.9"), "schema_version: is '0.9'"),
         (_set("schema_version", "one"), "schema_version: is 'one'"),

@@ -187,8 +187,6 @@ class Part:
         view_range: the declared one, or None; see `default_view_range`.
         symmetries: declared rotations of the whole part.
         datums: in order of precedence.
-        features: that characteristics are about; a feature is described like a datum, its label is its name.
-        characteristics: requirements of the drawing beside the tolerances of the components.
         guides: views of the part file.
         serial: serial number of the specimen, or None.
         serial_pattern: regular expression that a code on the part must match to be a serial number; empty: the form of
@@ -196,6 +194,8 @@ class Part:
         up: axis of the model that is up; the part file's, else the format's.
         notes: remarks of the loader on renamed or empty components.
         paths: of each component of ``settings``, its names in the assembly from the root on; empty if not known.
+        features: that characteristics are about; a feature is described like a datum, its label is its name.
+        characteristics: requirements of the drawing beside the tolerances of the components.
     """
 
     name: str
@@ -206,14 +206,14 @@ class Part:
     view_range: ViewRange | None = None
     symmetries: tuple[Symmetry, ...] = ()
     datums: tuple[Datum, ...] = ()
-    features: tuple[Datum, ...] = ()
-    characteristics: tuple[Characteristic, ...] = ()
     guides: tuple[Guide, ...] = ()
     serial: str | None = None
     serial_pattern: str = ""
     up: Up = "z"
     notes: tuple[str, ...] = ()
     paths: tuple[tuple[str, ...], ...] = ()
+    features: tuple[Datum, ...] = ()
+    characteristics: tuple[Characteristic, ...] = ()
 
     def __repr__(self) -> str:
         serial = f" {self.serial}" if self.serial else ""

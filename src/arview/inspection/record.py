@@ -339,12 +339,12 @@ class Inspection:
         created: time of the measurement, UTC.
         components: an entry for each inspected component; components of the model may be omitted.
         provenance: origin of the numbers.
-        characteristics: requirements of the drawing, in the order of the part file.
         datum_system: the frame of the deviations; None in files of version 1.0.
         warnings: doubts about the inspection as a whole.
         foreign_objects: objects that are not in the CAD model, the largest first.
         distance_map: distances of the cloud to the CAD model, if there is a cloud.
         repeatability: comparison of two halves of the photos; None if it was not made.
+        characteristics: requirements of the drawing, in the order of the part file.
 
     Raises:
         InputError: a component appears twice, or ``created`` has no time zone.
@@ -356,12 +356,12 @@ class Inspection:
     created: datetime
     components: tuple[ComponentDeviation, ...]
     provenance: Provenance
-    characteristics: tuple[CharacteristicResult, ...] = ()
     datum_system: DatumSystem | None = None
     warnings: tuple[str, ...] = ()
     foreign_objects: tuple[ForeignReport, ...] = ()
     distance_map: DistanceReport | None = None
     repeatability: Repeatability | None = None
+    characteristics: tuple[CharacteristicResult, ...] = ()
 
     def __post_init__(self) -> None:
         if self.created.utcoffset() != timedelta(0):

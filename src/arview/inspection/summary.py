@@ -44,8 +44,11 @@ def verdict_sentence(inspection: Inspection) -> str:
     if inspection.foreign_objects:
         parts.append(f"{len(inspection.foreign_objects)} foreign object{'s' * (len(inspection.foreign_objects) > 1)}")
     sentence = f"{total} component{'s' * (total != 1)}: {', '.join(parts)}" if parts else "no components"
-    judged = Counter(one.verdict for one in inspection.characteristics)
-    if not judged:
+    verdicts = Counter(one.verdict for one in inspection.characteristics)
+    if not verdicts:
         return sentence
-    count, words = judged.total(), ", ".join(f"{judged[key]} {word}" for key, word in _WORDS.items() if judged[key])
+    count, words = (
+        verdicts.total(),
+        ", ".join(f"{verdicts[key]} {word}" for key, word in _WORDS.items() if verdicts[key]),
+    )
     return f"{sentence}; {count} characteristic{'s' * (count != 1)}: {words}"

@@ -22,7 +22,7 @@ from arview.measurement.datums.alignment import Alignment, align
 from arview.measurement.datums.cad_features import round_faces
 from arview.measurement.datums.equations import DatumEquations, point_from_move
 from arview.measurement.features import STATE, MeasuredFeature, component_feature, feature_of, joint_state
-from arview.measurement.measurand import Measurand
+from arview.measurement.measurand import measurand_of
 from arview.measurement.options import ComponentMeasurement, combined_of
 from arview.measurement.uncertainty.decision import decide, worst
 from arview.measurement.uncertainty.pose_propagation import PosePropagation
@@ -77,7 +77,6 @@ def measure_characteristics(
     part: Part,
     measure_one: MeasureFeature,
     results: Mapping[str, ComponentMeasurement],
-    measurands: Mapping[str, Measurand],
     frames: Frames,
     guard: float,
     mm_per_px: Callable[[Array], float],
@@ -89,7 +88,6 @@ def measure_characteristics(
         part: the part.
         measure_one: measures a feature.
         results: of the components.
-        measurands: stated points of the components.
         frames: see `Frames`.
         guard: share of U kept from a limit.
         mm_per_px: size of a pixel at a point (3,).
@@ -107,7 +105,7 @@ def measure_characteristics(
                 ways, note = measure_one(datum)
                 features[name] = replace(feature_of(datum, component, ways, frames.poses, px_mm), note=note)
             else:
-                features[name] = _component(name, part, results, measurands, frames.poses)
+                features[name] = _component(name, part, results, frames.poses)
         except InputError as error:
             features[name] = str(error).removeprefix("datum ")
     decisions = _Decisions(part, features, frames, guard)
@@ -123,14 +121,13 @@ def _component(
     name: str,
     part: Part,
     results: Mapping[str, ComponentMeasurement],
-    measurands: Mapping[str, Measurand],
     poses: PosePropagation | None,
 ) -> MeasuredFeature:
     """A component as a feature. Raises InputError where it was not measured."""
-    together = combined_of(results[name]) if name in results and name in measurands else None
+    together = combined_of(results[name]) if name in results else None
     if together is None:
         raise InputError(f"{name!r} was not measured")
-    measurand = measurands[name]
+    measurand = measurand_of(name, part)
     return component_feature(part.model.component(name), measurand.point_in_model, measurand.axes[2], together, poses)
 
 

@@ -28,7 +28,6 @@ from arview.measurement.uncertainty.pose_propagation import PosePropagation
 
 METHODS: tuple[Method, ...] = ("sweep", "edges")
 """By which the offsets of a flat face may be measured: on its surface, and along its border."""
-ROUND = ("hole", "pin", "cylinder")
 STATE = 7
 """Numbers of a feature's state: twist about its centre in model axes (rad, mm), and the change of its radius, mm."""
 CELLS = 5
@@ -110,7 +109,7 @@ def feature_of(
     middle = ways[0].points.mean(axis=0)
     places = _places(datum, component)
     # A rim is centred on its axis, at the end that is seen; a face or an edge in its own middle.
-    center = point + axis * (axis @ (middle - point)) if datum.feature in ROUND else places.mean(axis=0)
+    center = places.mean(axis=0) if datum.feature in ("plane", "edge") else point + axis * (axis @ (middle - point))
     reach_mm = max(1.0, float(np.sqrt(np.mean(np.sum((ways[0].points - center) ** 2, axis=1)))))
     found: list[MeasuredFeature] = []
     faults: list[DatumNotMeasuredError] = []
@@ -210,8 +209,10 @@ def component_feature(
     by_poses = np.zeros((STATE, 0))
     if poses is not None:
         by_poses = np.concatenate([twist := poses.twist(component, point), np.zeros((1, twist.shape[1]))])
+    along = (component.vertices_in_model - point) @ axis
+    places = point + np.outer([along.min(), along.max()], axis)
     return MeasuredFeature(
-        component.name, "fit", point, axis, point[None], 0.0, state, covariance,
+        component.name, "fit", point, axis, places, 0.0, state, covariance,
         np.concatenate([free, np.zeros((len(free), 1))], axis=1), by_poses,
     )  # fmt: skip
 
@@ -250,7 +251,8 @@ def _places(datum: Datum, component: Component) -> Array:
         vertices = component.vertices_in_model[np.unique(component.faces[round_faces(component, datum)[0]])]
         along = (vertices - center) @ np.array(datum.direction_in_model)
         return center + np.outer([along.min(), along.max()], datum.direction_in_model)
-    return center[None]
+    # A rim or a point shows nothing of its tilt; the second place lets an orientation ask for it.
+    return center + np.outer([0.0, datum.diameter_mm or 1.0], datum.direction_in_model)
 
 
 def _form(one: DatumEquations, fit: DatumFit, residuals: Array, normal: Array) -> FlatForm | None:

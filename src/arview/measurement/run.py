@@ -137,20 +137,6 @@ def _measure(
         record = in_partial_frame(record, failed)
         deviations.append(with_seen_from(with_hidden(record, MOSTLY_HIDDEN) if is_hidden else record, seen))
         tell("uncertainty", done, len(names))
-    characteristics: tuple[CharacteristicResult, ...] = ()
-    if part.characteristics:
-        rough = _rough_frame(alignment.origin_in_model, size_mm := _size_mm(part.model, base))
-        frames = Frames(alignment, rough, size_mm, reconstruction.scale.scale_std or 0.0, poses)
-        moves = {
-            name: _as_move(name, together)
-            for name in {one.component for one in part.features if one.component in results}
-            if (together := combined_of(results[name])) is not None
-        }
-        measure_feature = _feature_measurement(reconstruction, views, part, moves)
-        px_mm = views.mm_per_px if views is not None else lambda point: 0.0
-        characteristics = measure_characteristics(
-            part, measure_feature, results, measurands, frames, options.decision.guard, px_mm, tell
-        )
     if BY_SHAPE in warnings:
         deviations, doubts = with_unsure_names(deviations, part)
         warnings += doubts
@@ -171,7 +157,7 @@ def _measure(
         created=datetime.now(UTC),
         components=tuple(deviations),
         provenance=provenance_of(reconstruction, options, time.process_time() - began),
-        characteristics=characteristics,
+        characteristics=_characteristics(reconstruction, views, part, results, alignment, poses, options, tell),
         datum_system=datum_record(alignment, part, base, reconstruction, failed),
         warnings=tuple(warnings),
         foreign_objects=foreign,
@@ -292,6 +278,33 @@ def _datum_measurement(
         return measure_datums_in_cloud((datum,), part.model, reconstruction.cloud, fitted)[0]
 
     return measure_one
+
+
+def _characteristics(
+    reconstruction: MetricReconstruction,
+    views: PhotoViews | None,
+    part: Part,
+    results: Mapping[str, ComponentMeasurement],
+    alignment: Alignment,
+    poses: PosePropagation | None,
+    options: MeasureOptions,
+    tell: Progress,
+) -> tuple[CharacteristicResult, ...]:
+    """The characteristics of the part file, measured and judged."""
+    if not part.characteristics:
+        return ()
+    size_mm = _size_mm(part.model, base_names(part))
+    rough = _rough_frame(alignment.origin_in_model, size_mm)
+    moves = {name: _as_move(name, together) for name in results if (together := combined_of(results[name])) is not None}
+    return measure_characteristics(
+        part,
+        _feature_measurement(reconstruction, views, part, moves),
+        results,
+        Frames(alignment, rough, size_mm, reconstruction.scale.scale_std or 0.0, poses),
+        options.decision.guard,
+        views.mm_per_px if views is not None else lambda point: 0.0,
+        tell,
+    )
 
 
 def _feature_measurement(
