@@ -118,4 +118,4 @@ def test_the_report_has_what_matters_most_first(found: Inspection, tmp_path: Pat
     assert names[:3] == ["width", "tilt", "gap"] and "bore &lt;1&gt;" in names[3:]
     assert "⌀0.421" in table and "A | B(M)" in table and "drawing 4711" in table
     summary = page[page.index('<section id="summary">') : page.index('<section id="components">')]
-    assert "12.210 of 11.9 to 12.1 mm" in summary
+    assert "12.210 mm, allowed 11.9 to 12.1 mm" in summary

@@ -115,7 +115,7 @@ def feature_of(
     faults: list[DatumNotMeasuredError] = []
     for one in ways:
         try:
-            found.append(_solved(datum, component, one, poses, px_mm, center, places, reach_mm))
+            found.append(_solved(datum, one, poses, px_mm, center, places=places, reach_mm=reach_mm))
         except DatumNotMeasuredError as error:
             faults.append(error)
     if not found:
@@ -124,11 +124,19 @@ def feature_of(
         return found[0]
     moves = [
         Move(
-            datum.component, method, center, feature.state[:6], feature.covariance[:6, :6],
-            feature.undetermined[:, :6] / _unit(reach_mm), reach_mm, 0, 0.0, 1.0,
+            datum.component,
+            method,
+            center,
+            twist=feature.state[:6],
+            covariance=feature.covariance[:6, :6],
+            undetermined=feature.undetermined[:, :6] / _unit(reach_mm),
+            radius_mm=reach_mm,
+            used=0,
+            residual_mm=0.0,
+            support=1.0,
         )
         for feature, method in zip(found, METHODS, strict=False)
-    ]  # fmt: skip
+    ]
     both = component_feature(component, center, axis, combine(moves), None)
     by_poses = np.mean([feature.by_poses for feature in found], axis=0)
     return replace(
@@ -143,7 +151,6 @@ def _unit(reach_mm: float) -> Array:
 
 def _solved(
     datum: Datum,
-    component: Component,
     one: DatumEquations,
     poses: PosePropagation | None,
     px_mm: float,
@@ -188,12 +195,16 @@ def _solved(
         center,
         axis,
         places,
-        0.5 * (datum.diameter_mm or 0.0),
-        state,
-        covariance,
-        np.concatenate([free, np.zeros((len(free), 1))], axis=1),
-        np.zeros((STATE, 0)) if poses is None else gain @ poses.offsets(one.rows, one.points, one.feature == "fit"),
-        _form(one, fit, one.offsets_mm - design @ solution @ one.offsets_mm, axis) if one.feature == "plane" else None,
+        radius_mm=0.5 * (datum.diameter_mm or 0.0),
+        state=state,
+        covariance=covariance,
+        undetermined=np.concatenate([free, np.zeros((len(free), 1))], axis=1),
+        by_poses=np.zeros((STATE, 0))
+        if poses is None
+        else gain @ poses.offsets(one.rows, one.points, one.feature == "fit"),
+        form=_form(one, fit, one.offsets_mm - design @ solution @ one.offsets_mm, axis)
+        if one.feature == "plane"
+        else None,
     )
 
 
@@ -212,9 +223,17 @@ def component_feature(
     along = (component.vertices_in_model - point) @ axis
     places = point + np.outer([along.min(), along.max()], axis)
     return MeasuredFeature(
-        component.name, "fit", point, axis, places, 0.0, state, covariance,
-        np.concatenate([free, np.zeros((len(free), 1))], axis=1), by_poses,
-    )  # fmt: skip
+        component.name,
+        "fit",
+        point,
+        axis,
+        places,
+        radius_mm=0.0,
+        state=state,
+        covariance=covariance,
+        undetermined=np.concatenate([free, np.zeros((len(free), 1))], axis=1),
+        by_poses=by_poses,
+    )
 
 
 def joint_state(

@@ -10,7 +10,7 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.cad import ComponentSettings, Part
+from arview.cad import Part
 from arview.core.stage_cache import content_key
 from arview.geometry import Array, exp_so3, rigid
 from arview.inspection import (
@@ -89,7 +89,7 @@ def component_record(
     counted = {move.method for move in moves if move.method != "cloud"}
     is_open = any(pair.is_contradiction and {pair.first, pair.second} <= counted for pair in pairs)
     free = free_directions(component, part, center, together.radius_mm)
-    verdict = _verdict(placed, tolerance_mm, settings, free, options, notes)
+    verdict = _verdict(placed, tolerance_mm, settings.angle_tolerance_deg, free, options, notes)
     if is_open and verdict is Verdict.PASS:
         verdict = Verdict.UNDECIDED
     tilt_deg, twist_deg = tilt_and_twist(placed)
@@ -108,7 +108,7 @@ def component_record(
         twist_deg=twist_deg,
         presence=MeasuredPresence.PRESENT,
         details=replace(
-            _details(placed, together, measurand, settings),
+            _details(placed, together, measurand, settings.angle_tolerance_deg),
             methods=methods,
             notes=tuple(notes),
             agreement=tuple(
@@ -124,7 +124,7 @@ def component_record(
 def _verdict(
     placed: MeasuredPlacement,
     tolerance_mm: float | None,
-    settings: ComponentSettings,
+    angle_tolerance_deg: float | None,
     free: Array,
     options: MeasureOptions,
     notes: list[str],
@@ -140,15 +140,15 @@ def _verdict(
         verdicts.append(decide(value, distance.uncertainty, tolerance_mm, guard))
         if verdicts[0] is Verdict.PASS and distance.value > cast(float, tolerance_mm):
             verdicts = [Verdict.UNDECIDED]
-    if settings.angle_tolerance_deg is not None and angle is not None:
-        limit = np.deg2rad(settings.angle_tolerance_deg)
+    if angle_tolerance_deg is not None and angle is not None:
+        limit = np.deg2rad(angle_tolerance_deg)
         verdicts.append(
             decide(angle.corrected if options.corrects_bias else angle.value, angle.uncertainty, limit, guard)
         )
         if verdicts[-1] is Verdict.FAIL:
-            notes.append(f"turned by {np.rad2deg(angle.value):.2f}°, {settings.angle_tolerance_deg:g}° allowed")
+            notes.append(f"turned by {np.rad2deg(angle.value):.2f}°, {angle_tolerance_deg:g}° allowed")
     verdict = worst(verdicts)
-    unjudged = _unjudged(placed, free, settings.angle_tolerance_deg)
+    unjudged = _unjudged(placed, free, angle_tolerance_deg)
     notes += unjudged
     if unjudged and verdict is Verdict.PASS:
         verdict = Verdict.UNDECIDED
@@ -182,7 +182,7 @@ def _direction_text(axis: Array) -> str:
 
 
 def _details(
-    placed: MeasuredPlacement, together: CombinedMove, measurand: Measurand, settings: ComponentSettings
+    placed: MeasuredPlacement, together: CombinedMove, measurand: Measurand, angle_tolerance_deg: float | None
 ) -> Details:
     """Details of a component's record."""
     rotation = exp_so3(placed.twist[:3])
@@ -209,7 +209,7 @@ def _details(
         zone_diameter_mm=None if distance is None else zone_diameter_mm(distance.value),
         angle_deg=None if angle is None else float(np.rad2deg(angle.value)),
         angle_uncertainty_deg=None if angle is None else float(np.rad2deg(angle.uncertainty)),
-        angle_tolerance_deg=settings.angle_tolerance_deg,
+        angle_tolerance_deg=angle_tolerance_deg,
         budget=() if distance is None else tuple(BudgetLine(*line) for line in placed.budget()),
     )
 

@@ -123,9 +123,16 @@ def _of_drawing(one: CharacteristicResult) -> _Characteristic:
     u = "" if one.uncertainty_mm is None else f"U = {fixed(one.uncertainty_mm, decimals)} mm; "
     lower, upper = one.range_mm
     return _Characteristic(
-        one.name, f"{one.kind} of {', '.join(one.of)}", "mm", decimals, upper, one.zone_mm is not None, one.value_mm,
-        u + one.verdict.value, lower=lower,
-    )  # fmt: skip
+        one.name,
+        f"{one.kind} of {', '.join(one.of)}",
+        "mm",
+        decimals,
+        upper,
+        is_length_from_zero=one.zone_mm is not None,
+        value=one.value_mm,
+        remark=u + one.verdict.value,
+        lower=lower,
+    )
 
 
 def _value(index: int, row: _Characteristic) -> list[tuple[str, str]]:

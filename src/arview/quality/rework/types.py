@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from arview.inspection import Vector3
-
 
 @dataclass(frozen=True)
 class ReworkMove:
@@ -20,7 +18,7 @@ class ReworkMove:
     """
 
     text: str
-    axis_in_model: Vector3
+    axis_in_model: tuple[float, float, float]
     distance_mm: float
     uncertainty_mm: float
 
@@ -37,7 +35,7 @@ class ReworkTurn:
     """
 
     text: str
-    axis_in_model: Vector3
+    axis_in_model: tuple[float, float, float]
     angle_deg: float
     uncertainty_deg: float
 
