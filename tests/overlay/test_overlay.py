@@ -19,14 +19,16 @@ from arview.cad.model import Component, Model, make_model
 from arview.camera import Camera
 from arview.errors import InputError, MismatchError
 from arview.geometry import Array, apply, look_at, rigid
-from arview.inspection import ComponentDeviation, Finding, Inspection, Provenance, Verdict
+from arview.inspection import CharacteristicResult, ComponentDeviation, Finding, Inspection, Provenance, Verdict
 from arview.overlay import OverlayOptions, OverlayRenderer, age_text, labels, paint
 from arview.overlay.ghost import CELL_PX
 from arview.overlay.layout import LabelLayout, LabelRequest, PlacedLabel
 from arview.overlay.options import VERDICT_RGB
 from arview.overlay.status import StatusLine
 from arview.pose import ComponentPresence, Pose, Presence, TrackingState, Visibility
+from helpers.inspections import bench_inspection
 from helpers.paths import SHARED
+from helpers.photo_scene import bench
 
 PLATE = SHARED / "sequences" / "plate"
 CAMERA = Camera(640, 480, 700.0, 700.0, 319.5, 239.5)
@@ -509,3 +511,17 @@ def test_labels_say_which_places_depend_on_the_ambiguous_pose() -> None:
         assert {one.text.name for one in renderer.laid_out.labels} == {"middle", "side"}
         noted = {one.text.name for one in renderer.laid_out.labels if "one of two places" in one.lines}
         assert noted == expected
+
+
+def test_a_failed_characteristic_has_a_label_at_its_place() -> None:
+    """Its zone and what is allowed; the count in the status line has it, and a passed one gets no label."""
+    model = bench()
+    one = CharacteristicResult(
+        "bore", "position", ("bore",), Verdict.FAIL, value_mm=0.4213, uncertainty_mm=0.03, zone_mm=0.3,
+        zone="diameter", point_mm=(0.0, 0.0, 0.0),
+    )  # fmt: skip
+    passed = replace(one, name="other", verdict=Verdict.PASS, value_mm=0.1)
+    measured = replace(bench_inspection(model), characteristics=(passed, one))
+    (label, point), *others = labels.characteristic_labels(measured)
+    assert not others and (label.name, label.value, label.word) == ("bore", "Ø0.421 (Ø0.3)", "FAIL")
+    assert point.tolist() == [0.0, 0.0, 0.0]

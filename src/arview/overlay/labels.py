@@ -267,6 +267,19 @@ def label_text(
     )
 
 
+def characteristic_labels(inspection: Inspection | None) -> list[tuple[LabelText, Array]]:
+    """Labels of the characteristics that fail or are undecided, most urgent first, and where each is in the model."""
+    shown = [one for one in inspection.characteristics if one.point_mm and _RANK[one.verdict] < 2] if inspection else []
+    shown.sort(key=lambda one: (_RANK[one.verdict], -one.excess_mm))
+    # The font of the labels has no diameter sign.
+    signs = str.maketrans({"-": "−", "⌀": "Ø"})
+    texts = [f"{one.value_text} ({one.allowed_text})".translate(signs) for one in shown]
+    return [
+        (LabelText(one.name, text, VERDICT_WORD[one.verdict], verdict=one.verdict), np.array(one.point_mm))
+        for one, text in zip(shown, texts, strict=True)
+    ]
+
+
 def displacement_texts(
     presence: ComponentPresence, center_in_model: Array | None, options: OverlayOptions
 ) -> tuple[str, tuple[str, ...]]:

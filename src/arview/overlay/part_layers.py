@@ -45,6 +45,10 @@ _LEARNING_QUALITY = 0.5
 _ARROW_RGB = (255, 255, 255)
 
 
+_POINT_PX = 1000
+"""Visible pixels that count for the point of a characteristic, which has no area."""
+
+
 @dataclass(frozen=True)
 class _PartLook:
     """What is drawn of the components, as long as the evidence on them stays the same.
@@ -117,6 +121,7 @@ class PartLayers:
         self._names = tuple(component.name for component in model.components)
         self._deviations = [inspection.find(name) if inspection else None for name in self._names]
         found = zip(self._names, self._deviations, strict=True)
+        self._characteristics = labels.characteristic_labels(inspection)
         self._pending = frozenset(name for name, one in found if one is None and name in pending)
         self._status = self._make_status()
         self._bottom_px = camera.height
@@ -307,6 +312,10 @@ class PartLayers:
         anchors_px = self._ghost.project(anchors_in_cam)
         notes = self._open_notes(pose)
         result = []
+        is_withheld = pose.is_label_withheld and self.options.show_evidence
+        for label, point in [] if is_withheld else self._characteristics:
+            at = apply(pose.cam_from_model, point)
+            result.append(LabelledComponent(label, self._ghost.project(at[None])[0], at, _POINT_PX))
         for index in scene.order:
             note = notes.get(index) or (labels.OCCLUDED if self._hidden.flags[index] else "")
             text = self._text(index, presences[index], scene, note)

@@ -160,6 +160,7 @@ class StatusLine:
         if is_withheld:
             return [*items, ("labels withheld", VERDICT_RGB[Verdict.UNDECIDED])]
         verdicts = [component.verdict for component in inspection.components]
+        verdicts += [one.verdict for one in inspection.characteristics]
         items += [
             (f"{verdicts.count(verdict)} {VERDICT_WORD[verdict]}", VERDICT_RGB[verdict])
             for verdict in _COUNT_ORDER
