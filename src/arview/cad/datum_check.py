@@ -40,10 +40,10 @@ class RoundEdge:
 
 
 def datum_problems(part: Part) -> list[str]:
-    """A text for each datum plane, hole, pin or cylinder that is not where the part file has it."""
+    """A text for each plane, hole, pin or cylinder, datum or other feature, that is not where the part file has it."""
     rims: dict[str, list[RoundEdge]] = {}
     texts, names = [], {component.name for component in part.model.components}
-    for datum in part.datums:
+    for datum in (*part.datums, *part.features):
         if datum.component not in names:
             continue
         component = part.model.component(datum.component)
@@ -56,7 +56,7 @@ def datum_problems(part: Part) -> list[str]:
         else:
             continue
         if text:
-            texts.append(text)
+            texts.append(text if datum in part.datums else text.replace("datum", "feature", 1))
     return texts
 
 

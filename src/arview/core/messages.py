@@ -126,6 +126,7 @@ CATALOGUE = {
     "walk.provisional": "{count} photos; provisional numbers from {placed}",
     "walk.measuring": "measuring",
     "walk.first": "reading the first measurement",
+    "walk.stale": "a component of it was checked again; inspect the whole part for this value",
     "walk.checked_again": "{names} checked again {time}",
     # Guided capture.
     "capture.not_tracked": "part not tracked",

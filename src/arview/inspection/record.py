@@ -245,6 +245,7 @@ class CharacteristicResult:
         limits_mm: smallest and largest value allowed; None: not limited.
         nominal_mm: value of the design, of kinds with limits.
         datums: labels of its datums, ``B(M)`` at maximum material.
+        components: names of the components that carry it.
         point_mm: (3,) where it is shown on the part, in the model.
         reason: why it was not measured; empty if it was.
         notes: what the value leaves out.
@@ -263,6 +264,7 @@ class CharacteristicResult:
     limits_mm: tuple[float | None, ...] = (None, None)
     nominal_mm: float | None = None
     datums: tuple[str, ...] = ()
+    components: tuple[str, ...] = ()
     point_mm: tuple[float, ...] = ()
     reason: str = ""
     notes: tuple[str, ...] = ()

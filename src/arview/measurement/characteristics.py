@@ -136,6 +136,7 @@ class _Decisions:
 
     def __init__(self, part: Part, features: Mapping[str, MeasuredFeature | str], frames: Frames, guard: float) -> None:
         self.part, self.features, self.frames, self.guard = part, features, frames, guard
+        self.datums = {datum.label: datum for datum in (*part.datums, *part.features)}
         self.sizes: dict[str, tuple[float, float]] = {}
         """By feature: how far its size is off maximum material, and U, mm."""
 
@@ -151,6 +152,9 @@ class _Decisions:
             zone=one.zone,
             limits_mm=one.limits_mm,
             datums=marked,
+            components=tuple(
+                dict.fromkeys(self.datums[name].component if name in self.datums else name for name in one.of)
+            ),
             source=one.source,
         )
         try:
@@ -189,7 +193,7 @@ class _Decisions:
         return replace(empty, verdict=worst(verdicts), value_mm=value, uncertainty_mm=uncertainty, nominal_mm=nominal)
 
     def _is_hole(self, name: str) -> bool:
-        datum = next(datum for datum in (*self.part.datums, *self.part.features) if datum.label == name)
+        datum = self.datums[name]
         if datum.feature != "cylinder":
             return datum.feature == "hole"
         return round_faces(self.part.model.component(datum.component), datum)[1] < 0

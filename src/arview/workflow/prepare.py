@@ -114,6 +114,8 @@ def measurement_key(prepared: Prepared) -> str:
         part.name,
         part.settings,
         part.datums,
+        part.features,
+        part.characteristics,
         part.serial,
         part.effective_view_range,
         replace(options, maps_folder=None),

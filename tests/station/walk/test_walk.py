@@ -15,7 +15,7 @@ import pytest
 from arview.cad import load_part
 from arview.errors import InputError
 from arview.geometry import Array
-from arview.inspection import Inspection, Verdict
+from arview.inspection import CharacteristicResult, Inspection, Verdict, load_inspection, save_inspection
 from arview.station.walk.job import JobFolder, start_worker
 from arview.station.walk.merged import before_after, merged
 from helpers.walk_bench import AGAIN, PART, POSES, WRONG_MM, part_model, photo, write_part
@@ -122,8 +122,20 @@ def test_a_component_put_right_is_checked_again(measured: JobFolder, station: St
     assert change.name == "block_2" and change.before_mm is not None and change.after_mm is not None
     assert abs(change.before_mm - np.linalg.norm(WRONG_MM)) < 0.3 and change.after_mm < 0.4
     assert (change.verdict_before, change.verdict_after) == (Verdict.FAIL, right.verdict)
+    path = measured.path / "inspection.json"
+    before = path.read_bytes()
+    gap = CharacteristicResult(
+        "gap", "gap", ("left", "right"), Verdict.PASS, value_mm=1.0, uncertainty_mm=0.1, limits_mm=(0.5, None),
+        components=("block_2", "block_3"),
+    )  # fmt: skip
+    first = load_inspection(path)
+    save_inspection(replace(first, characteristics=(gap, replace(gap, name="other", components=("block_1",)))), path)
     now = merged(measured, model)
+    path.write_bytes(before)
     assert now is not None
+    stale, other = now.inspection.characteristics
+    assert stale.verdict is Verdict.NOT_MEASURED and stale.value_mm is None and "checked again" in stale.reason
+    assert other.verdict is Verdict.PASS
     assert {one.verdict for one in now.inspection.components} == {Verdict.PASS, right.verdict}
     assert now.origins["block_2"] == recheck.id and now.origins["block_1"] == measured.id
 

@@ -85,5 +85,17 @@ def _merged(first: JobFolder, rechecks: list[JobFolder], model: Model | None) ->
         )
     components = tuple(newest[one.name] for one in inspection.components)
     note = joined([inspection.provenance.note, *notes])
-    whole = replace(inspection, components=components, provenance=replace(inspection.provenance, note=note))
+    checked = {name for name, origin in origins.items() if origin != first.id}
+    characteristics = tuple(
+        replace(one, value_mm=None, uncertainty_mm=None, verdict=Verdict.NOT_MEASURED, reason=sentence("walk.stale"))
+        if checked & set(one.components)
+        else one
+        for one in inspection.characteristics
+    )
+    whole = replace(
+        inspection,
+        components=components,
+        characteristics=characteristics,
+        provenance=replace(inspection.provenance, note=note),
+    )
     return MergedInspection(whole, origins)

@@ -264,6 +264,7 @@ const de = {
   "walk.photos": "{count} Fotos",
   "walk.provisional": "{count} Fotos; vorläufige Werte aus {placed}",
   "walk.measuring": "Messung läuft",
+  "walk.stale": "ein Bauteil davon wurde nachgeprüft; für diesen Wert das ganze Teil prüfen",
   "walk.first": "die erste Messung wird gelesen",
   "walk.checked_again": "{names} noch einmal geprüft {time}",
   "code.inspection_model": "die geänderte Prüfung gehört zu einem anderen Modell; gezeigt wird die letzte gültige",
