@@ -6,6 +6,7 @@ import hashlib
 import signal
 import subprocess
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
