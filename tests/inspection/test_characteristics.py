@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from lxml import etree
 
+from arview.errors import InputError
 from arview.inspection import CharacteristicResult, Inspection, Verdict, save_inspection, to_csv, to_dfq, to_qif
 from arview.inspection.summary import overall_verdict, verdict_sentence
 from arview.report import make_report
@@ -119,3 +120,20 @@ def test_the_report_has_what_matters_most_first(found: Inspection, tmp_path: Pat
     assert "⌀0.421" in table and "A | B(M)" in table and "drawing 4711" in table
     summary = page[page.index('<section id="summary">') : page.index('<section id="components">')]
     assert "12.210 mm, allowed 11.9 to 12.1 mm" in summary
+
+
+def test_a_first_article_form_has_a_line_for_each(found: Inspection, tmp_path: Path) -> None:
+    """In the order of the part file; a template of one's own is used in the same way, and a wrong one is refused."""
+    save_inspection(replace(found, drawing="4711-02 rev. C"), tmp_path / "inspection.json")
+    page = tmp_path / "form.html"
+    make_report(tmp_path / "inspection.json", page, None, None, template="first-article")
+    text = page.read_text(encoding="utf-8")
+    assert re.findall(r"<tr><td>(\d)</td>", text) == [str(number) for number in range(1, 9)]
+    assert "4711-02 rev. C" in text and "bore &lt;1&gt;: ⌀0.6 | A | B(M)" in text
+    own = tmp_path / "own.html"
+    own.write_text("{{ drawing }}: {{ numbered|length }}")
+    make_report(tmp_path / "inspection.json", page, None, None, template=own)
+    assert page.read_text() == "4711-02 rev. C: 8"
+    own.write_text("{% if %}")
+    with pytest.raises(InputError, match=r"own\.html: cannot be used as a template"):
+        make_report(tmp_path / "inspection.json", page, None, None, template=own)

@@ -194,6 +194,7 @@ class Part:
         up: axis of the model that is up; the part file's, else the format's.
         notes: remarks of the loader on renamed or empty components.
         paths: of each component of ``settings``, its names in the assembly from the root on; empty if not known.
+        drawing: number and revision of the drawing, or empty.
         features: that characteristics are about; a feature is described like a datum, its label is its name.
         characteristics: requirements of the drawing beside the tolerances of the components.
     """
@@ -212,6 +213,7 @@ class Part:
     up: Up = "z"
     notes: tuple[str, ...] = ()
     paths: tuple[tuple[str, ...], ...] = ()
+    drawing: str = ""
     features: tuple[Datum, ...] = ()
     characteristics: tuple[Characteristic, ...] = ()
 

@@ -54,6 +54,7 @@ cad = "bracket_plate.step"     # relative to this file
                                # trimesh, which writes the axes as they are), z for all others
 tol_linear_mm = 0.1            # STEP: largest distance of the triangles from the true surface
 tol_angular_deg = 10.0         # STEP: largest angle between neighbouring triangles of a curved surface
+drawing = "4711-02 rev. C"     # number and revision of the drawing, for the report
 serial = "BP-0042"             # of the specimen at hand, shown in the overlay
 # DataMatrix and QR codes on the part whose text matches this regular expression are serial numbers; all others are
 # ignored. Default: texts of the form of the serial number, here BP- and four digits. An AprilTag's text is its family
@@ -257,6 +258,7 @@ def _read_part(root: TomlTable, path: Path, unit: str | None, load: Callable[...
     except InputError as error:
         raise InputError(f"{path}: [part] {error}") from error
     serial = head.line("serial", "") or None
+    drawing = head.line("drawing", "")
     serial_pattern = _read_pattern(head)
     head.finish()
     if not cad_path.is_file():
@@ -300,6 +302,7 @@ def _read_part(root: TomlTable, path: Path, unit: str | None, load: Callable[...
         view_range=view_range,
         symmetries=symmetries,
         datums=datums,
+        drawing=drawing,
         features=features,
         characteristics=characteristics,
         guides=guides,

@@ -29,7 +29,8 @@ INSPECTION is the file of `arview measure`. The report holds the verdict, a tabl
 of each finding (photo, ghost at the nominal place, arrow), distance map and histogram, uncertainty
 budget, datums, photos, how it was measured, a 3D view of CAD, cloud and arrows, the rework of what is out
 of tolerance, and what people decided. It is one file that needs no network. The PDF has all of this except
-the 3D view, and the inspection as an attachment.
+the 3D view, and the inspection as an attachment. `--template first-article` writes a form after AS9102
+with a line for each characteristic; src/arview/report/first_article.html is one to start from.
 
 \b
 Pictures are made from the photos in the folder of `arview reconstruct` (default: that of INSPECTION), and
@@ -41,6 +42,7 @@ need --part. Whatever is not available is left out, and the report says so.""",
 @click.option("--part", "part_path", metavar="PART", help="Part file or CAD file that was measured against.")
 @click.option("--folder", metavar="OUT", help="Folder of `arview reconstruct`, if INSPECTION is not in it.")
 @click.option("--photos", metavar="FOLDER", help="Folder of the photos, if they were moved.")
+@click.option("--template", metavar="NAME|FILE", help="first-article, or a Jinja template of your own.")
 @UNIT
 def report(
     inspection: str,
@@ -49,6 +51,7 @@ def report(
     part_path: str | None,
     folder: str | None,
     photos: str | None,
+    template: str | None,
     unit: str | None,
 ) -> None:
     """Write the report of INSPECTION as one HTML file, and as PDF."""
@@ -63,7 +66,9 @@ def report(
     paper = None if pdf is None else output_path(pdf, [*inputs, html])
     part = None if part_path is None else load_part(part_path, unit)
     with stage_bar() as progress:
-        evidence = make_report(source, html, paper, part, folder=folder, photos=photos, progress=progress)
+        evidence = make_report(
+            source, html, paper, part, folder=folder, photos=photos, progress=progress, template=template
+        )
     for reason in evidence.absent.values():
         say(f"left out: {reason}")
     for path in (html, paper):

@@ -49,6 +49,7 @@ def from_document(document: dict[str, Any]) -> Inspection:
             options=tuple(source.get("options", {}).items()),
             cpu_s=source.get("cpu_s"),
         ),
+        drawing=document.get("drawing", ""),
         characteristics=tuple(from_json(CharacteristicResult, one) for one in document.get("characteristics", ())),
         datum_system=None if datums is None else from_json(DatumSystem, datums),
         warnings=tuple(document.get("warnings", ())),

@@ -347,6 +347,7 @@ class Inspection:
         distance_map: distances of the cloud to the CAD model, if there is a cloud.
         repeatability: comparison of two halves of the photos; None if it was not made.
         characteristics: requirements of the drawing, in the order of the part file.
+        drawing: number and revision of the drawing; may be empty.
 
     Raises:
         InputError: a component appears twice, or ``created`` has no time zone.
@@ -364,6 +365,7 @@ class Inspection:
     distance_map: DistanceReport | None = None
     repeatability: Repeatability | None = None
     characteristics: tuple[CharacteristicResult, ...] = ()
+    drawing: str = ""
 
     def __post_init__(self) -> None:
         if self.created.utcoffset() != timedelta(0):
@@ -405,6 +407,8 @@ class Inspection:
                 **{key: value for key, value in more.items() if value},
             },
         }
+        if self.drawing:
+            document["drawing"] = self.drawing
         if self.characteristics:
             document["characteristics"] = to_json(self.characteristics)
         if self.datum_system is not None:

@@ -154,6 +154,7 @@ def _measure(
         part=part.name,
         serial=part.serial or "",
         model_hash=part.model.source_hash,
+        drawing=part.drawing,
         created=datetime.now(UTC),
         components=tuple(deviations),
         provenance=provenance_of(reconstruction, options, time.process_time() - began),

@@ -65,6 +65,7 @@ def facts(inspection: Inspection) -> list[tuple[str, str]]:
     )
     return [
         ("Part", inspection.part),
+        *([("Drawing", inspection.drawing)] if inspection.drawing else []),
         ("Serial", inspection.serial or "none"),
         ("Measured", inspection.created.strftime("%Y-%m-%d %H:%M UTC")),
         ("By", f"{source.tool} {source.version}"),

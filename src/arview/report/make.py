@@ -20,6 +20,10 @@ PANGO_INSTALL_COMMAND = (
 )
 
 
+FORMS = {"first-article": Path(__file__).with_name("first_article.html")}
+"""Templates beside that of the report, by name."""
+
+
 def make_report(
     inspection: str | Path,
     html: str | Path | None = None,
@@ -29,6 +33,7 @@ def make_report(
     folder: str | Path | None = None,
     photos: str | Path | None = None,
     progress: Progress | None = None,
+    template: str | Path | None = None,
 ) -> ReportEvidence:
     """Write the report of an inspection as one self-contained HTML file, as PDF, or both.
 
@@ -40,6 +45,7 @@ def make_report(
         folder: folder of a reconstruction; default: the folder of the inspection, if it contains one.
         photos: folder of the photos if they were moved.
         progress: called with (step, done, total).
+        template: a Jinja template in place of the report's, or ``first-article``: a form for each characteristic.
 
     Returns:
         the data of the report; its ``absent`` explains what is missing.
@@ -58,13 +64,14 @@ def make_report(
     if pdf is not None:
         _weasyprint()
     report_progress("reading", 0, 1)
+    form = None if template is None else FORMS.get(str(template), Path(template))
     evidence = gather(inspection, part, folder, photos)
     context = build_context(evidence, report_progress)
     if html is not None:
-        write_file(Path(html), render(context, for_print=False).encode("utf-8"))
+        write_file(Path(html), render(context, False, form).encode("utf-8"))
     if pdf is not None:
         report_progress("PDF", 0, 1)
-        write_file(Path(pdf), pdf_of(render(context, for_print=True), evidence))
+        write_file(Path(pdf), pdf_of(render(context, True, form), evidence))
     report_progress("done", 1, 1)
     return evidence
 

@@ -8,6 +8,7 @@ import io
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from importlib import resources
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from markupsafe import Markup
 
 from arview import measurement, overlay, reconstruction
 from arview.core.progress import Progress
+from arview.errors import InputError
 from arview.geometry import Array
 from arview.inspection import (
     CharacteristicResult,
@@ -78,6 +80,8 @@ def build_context(evidence: ReportEvidence, progress: Progress) -> dict[str, Any
         "title": f"Inspection report: {title}",
         "running": f"Inspection report · {title} · {_moment(inspection)}",
         "part": inspection.part,
+        "drawing": inspection.drawing,
+        "measured": _moment(inspection),
         "serial": inspection.serial,
         "sha256": evidence.sha256,
         "source_name": evidence.source.name,
@@ -94,6 +98,7 @@ def build_context(evidence: ReportEvidence, progress: Progress) -> dict[str, Any
     }
     context |= _components(evidence) | _findings(evidence, gallery)
     context["characteristics"] = [_characteristic(one) for one in _by_excess(inspection)]
+    context["numbered"] = [_characteristic(one) for one in inspection.characteristics]
     context |= _distance_map(evidence) | _budget(inspection) | _datums(inspection)
     context |= repeatability_context(inspection) | decisions_context(evidence)
     progress("rework", 0, 1)
@@ -113,15 +118,23 @@ def build_context(evidence: ReportEvidence, progress: Progress) -> dict[str, Any
     return context
 
 
-def render(context: dict[str, Any], for_print: bool) -> str:
-    """The page as HTML, with the viewer for screens and without it for print."""
+def render(context: dict[str, Any], for_print: bool, template_path: Path | None = None) -> str:
+    """The page as HTML, with the viewer for screens and without it for print.
+
+    Raises:
+        InputError: the template cannot be read or is wrong.
+    """
     import jinja2
 
     from arview.web import font, three_js
 
     here = resources.files("arview.report")
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.ChainableUndefined, trim_blocks=True)
-    template = environment.from_string((here / "template.html").read_text(encoding="utf-8"))
+    try:
+        source = (template_path or here / "template.html").read_text(encoding="utf-8")
+        template = environment.from_string(source)
+    except (OSError, ValueError, jinja2.TemplateError) as error:
+        raise InputError(f"{template_path}: cannot be used as a template: {error}") from error
     faces = [
         f"@font-face {{ font-family: {family}; font-weight: {weight}; font-style: normal; "
         f'src: url({_data_url(font(name), "font/woff2")}) format("woff2"); }}'
@@ -213,6 +226,8 @@ def _characteristic(one: CharacteristicResult) -> dict[str, Any]:
     return {
         "name": one.name,
         "kind": one.kind,
+        "of": ", ".join(one.of),
+        "source": one.source,
         "datums": " | ".join(one.datums),
         "value": one.value_text.replace("-", "−") if one.value_mm is not None else NONE,
         "uncertainty": number(one.uncertainty_mm, decimals_of(one.uncertainty_mm)),

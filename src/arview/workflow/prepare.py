@@ -116,6 +116,7 @@ def measurement_key(prepared: Prepared) -> str:
         part.datums,
         part.features,
         part.characteristics,
+        part.drawing,
         part.serial,
         part.effective_view_range,
         replace(options, maps_folder=None),
