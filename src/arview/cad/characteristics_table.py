@@ -58,7 +58,8 @@ def _read(table: TomlTable, targets: Mapping[str, DatumFeature], datums: Mapping
         table.fail("of", list(of), f'flat faces: {kind} is of features whose feature is "plane"')
     if kind == "size" and not features <= set(ROUND):
         table.fail("of", list(of), "a round feature: hole, pin or cylinder")
-    default: ZoneShape = "diameter" if features <= set(ROUND) else "sphere" if features <= {"fit"} else "width"
+    of_component: ZoneShape = "sphere" if kind == "position" else "diameter"
+    default: ZoneShape = "diameter" if features <= set(ROUND) else of_component if features <= {"fit"} else "width"
     zone = cast(ZoneShape, table.choice("zone", get_args(ZoneShape), default)) if kind == "position" else default
     labels = table.texts("datums", tuple(datums)) if kind not in ("flatness", *WITH_LIMITS) else ()
     at_maximum = tuple(label.removesuffix(MAXIMUM_MARK) for label in labels if label.endswith(MAXIMUM_MARK))
