@@ -174,6 +174,18 @@ def feature_scene(seed: int = 0, columns: int = 5, rows: int = 4) -> FeatureScen
             features.append(Datum(name, "plane", f"{side}_{index}", (float(at_x), float(y), 5.0), (sign, 0.0, 0.0)))
         across = Characteristic(f"gap_{index}", "gap", tuple(sides), limits_mm=(gap - 0.3, gap + 0.3))
         require(across, gap + opening)
+        outer = Datum(
+            f"outer_{index}",
+            "edge",
+            f"right_{index}",
+            (float(x + 0.5 * gap + 2 * half), float(y), height),
+            (0.0, 1.0, 0.0),
+        )
+        features.append(outer)
+        aside = Characteristic(
+            f"edge_{index}", "position", (outer.label,), 0.5, direction_in_model=(1.0, 0.0, 0.0), datums=everything
+        )
+        require(aside, 2.0 * abs(opening))
         tilted = Characteristic(f"top_{index} parallelism", "parallelism", (names[1],), 0.2, datums=("A",))
         require(tilted, 2.0 * half * abs(float(np.sin(np.deg2rad(tilt_deg)))))
     model = make_model("features", tuple(nominal))
