@@ -62,11 +62,13 @@ def cell(middle: Array, offset: Array, radius_mm: float) -> tuple[Array, list[tu
 def plate(columns: int, rows: int, radii_mm: Array, offsets: Array) -> Component:
     """A plate of cells, each with a hole."""
     size = np.array([columns, rows]) * CELL_MM
-    parts, faces = [], []
+    parts: list[Array] = []
+    faces: list[tuple[int, int, int]] = []
     for index in range(columns * rows):
         middle = (np.array([index % columns, index // columns]) + 0.5) * CELL_MM - 0.5 * size
         vertices, own = cell(middle, offsets[index], radii_mm[index])
-        faces += [tuple(np.add(face, sum(len(part) for part in parts))) for face in own]
+        before = sum(len(part) for part in parts)
+        faces += [(a + before, b + before, c + before) for a, b, c in own]
         parts.append(vertices)
     x, y = 0.5 * size
     start = sum(len(part) for part in parts)

@@ -48,6 +48,7 @@ from rows import ResultRow
 from suites.capture import capture_rows, capture_sets
 from suites.coverage import coverage_rows
 from suites.detection import DetectionSuite
+from suites.features import feature_rows
 from suites.guided_init import guided_init_rows
 from suites.identity import IdentitySuite
 from suites.measurement import measurement_rows
@@ -68,7 +69,7 @@ SECTIONS = (
     "track", "converge", "guided-init", "detect", "semisynthetic-track", "semisynthetic-detect", "false-alarms",
     "lookalike", "relocalize", "sample", "reconstruct", "measure", "real-track", "real-detect", "quality",
     "accepted", "scale", "presence", "several", "occluders", "coverage",
-    "capture", "identity",
+    "capture", "identity", "features",
 )  # fmt: skip
 
 
@@ -143,6 +144,7 @@ def main() -> None:
         lambda: coverage_rows(chosen.sets, chosen.use, chosen.folder / "coverage", details) if chosen.sets else [],
         lambda: capture_rows(capture_sets(chosen.photo_set), chosen.folder / "capture", details),
         IdentitySuite(found, details, chosen.two_parts, chosen.folder, chosen.frames, chosen.backgrounds).rows,
+        lambda: feature_rows(details),
     )
     sections = dict(zip(SECTIONS, makers, strict=True))
     rows: list[ResultRow] = []

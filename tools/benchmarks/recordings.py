@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from arview_lab.evaluation import Scene
 
 ROOT = Path(__file__).resolve().parents[2]
+sys.path.insert(0, str(ROOT / "tests"))  # the tests' photos with exact truth
 SAMPLE = ROOT / "samples" / "bracket_plate"
 SHARED = Path(os.environ.get("ARVIEW_DATA", ROOT.parent / "shared" / "data"))
 DATA = SHARED / "sequences"

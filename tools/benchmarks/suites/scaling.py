@@ -6,7 +6,6 @@ import json
 import math
 import multiprocessing
 import resource
-import sys
 import tempfile
 import time
 from collections import defaultdict
@@ -34,12 +33,10 @@ from arview.measurement.run import measure
 from arview.reconstruction.run import ReconstructOptions, reconstruct
 from arview.rendering import ZBufferRenderer
 from arview.tracking import TrackedPart, TrackingSession
-from recordings import ROOT
-
-sys.path.insert(0, str(ROOT / "tests"))  # the tests' photos with exact truth
 from helpers.photo_scene import photograph
 from helpers.photo_scene import write_photos as write_pictures
 from helpers.plate_scene import as_built, part
+from recordings import ROOT
 
 PLATE = ROOT / "samples" / "plate"
 PITCH_MM = 40.0
