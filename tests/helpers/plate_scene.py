@@ -51,8 +51,8 @@ def plate_with_holes() -> tuple[Array, Array]:
 
 @cache
 def nominal() -> Model:
-    vertices, faces = plate_with_holes()
-    parts = [Component("plate", vertices, faces.astype(np.int32))]
+    outline, triangles = plate_with_holes()
+    parts = [Component("plate", outline, triangles.astype(np.int32))]
     for i, (name, (x, y)) in enumerate(BLOCKS.items()):
         half = np.array([14.0 + i, 12.0, 10.0 + 2 * i])
         vertices, faces = box((x - half[0], y - half[1], 0), (x + half[0], y + half[1], 2 * half[2]))
