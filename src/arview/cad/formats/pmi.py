@@ -29,6 +29,7 @@ _STATEMENT = re.compile(
 _DRAWN = re.compile(rb"=\s*\(?\s*(?:TESSELLATED_)?ANNOTATION(?:_CURVE|_FILL_AREA|_SYMBOL|_TEXT)?_OCCURRENCE\b")
 _BOUNDS = re.compile(rb"=\s*TOLERANCE_VALUE\s*\(\s*#(\d+)\s*,\s*#(\d+)\s*\)")
 _MEASURE = re.compile(rb"#(\d+)\s*=\s*\(?[^;]*?MEASURE\s*\(\s*([-+.\dE]+)\s*\)")
+_ONLY_DRAWN = ("CommonLabel", "DimensionPresentation")
 _READ = """
 from arview.cad.formats.pmi_document import write_pmi
 write_pmi(*sys.argv[1:])
@@ -41,11 +42,10 @@ class PmiShape:
 
     Attributes:
         kind: plane, cylinder, edge (a straight one), or the name of another surface or curve.
-        point_in_model: middle of a plane or edge; on the axis of a cylinder, at an end.
-        direction_in_model: unit normal out of the material, or unit axis from that end into the cylinder; zero for
-            other surfaces.
+        point_in_model: middle of a face or edge; of a cylinder on its axis; the place of a vertex.
+        direction_in_model: unit normal out of the material, or unit axis; zero for other surfaces.
         diameter_mm: of a cylinder.
-        length_mm: of a cylinder or edge.
+        length_mm: of a cylinder along its axis.
         area_mm2: of a face.
         is_hole: the material is outside of the cylinder.
         corner_in_model: a corner of it; None where it has none.
@@ -70,11 +70,12 @@ class PmiRequirement:
         kind: as OpenCASCADE calls it: Size_Diameter, Location_LinearDistance, Position, ProfileOfSurface, ….
         shapes: that it is about; of a distance those of its first end.
         others: of a distance, the shapes of its other end.
-        value_mm: nominal value of a dimension, or width of the zone; None where there is none. Angles are in degrees.
+        value_mm: nominal value of a dimension (of limits the lower), or width of the zone; None where there is none.
+            Angles are in degrees.
         limits_mm: smallest and largest value of a dimension; None where the file has none.
         zone: None, Diameter or SphericalDiameter.
         modifiers: names of all that changes its meaning: M, L, All_Around, Free_State, theoretical, ….
-        datums: letter, place in the order of precedence, and modifiers of each datum.
+        datums: letter, number in the order of precedence, and modifiers of each datum, in that order.
         place: of the part that carries it, from 0, where it stands at several places of the assembly.
     """
 
@@ -91,17 +92,6 @@ class PmiRequirement:
 
 
 @dataclass(frozen=True)
-class PmiTarget:
-    """A datum target: its letter and number, its kind (point, line, circle, …), place and direction, mm."""
-
-    letter: str
-    number: int
-    kind: str
-    point_in_model: Vector
-    direction_in_model: Vector
-
-
-@dataclass(frozen=True)
 class Pmi:
     """What a STEP file says of the accuracy of its parts.
 
@@ -110,8 +100,8 @@ class Pmi:
         dimensions: with a meaning, in the order of the file, once for each place of their part.
         tolerances: as ``dimensions``.
         datums: shapes of the feature of each datum by its letter, for each place of its part.
-        targets: of the datums that are established from targets.
-        ambiguous: letters of datums of several parts.
+        targets: datum targets by letter and number, as in B2: kind (point, line, circle, …), middle, direction across
+            the surface (of a line along it), and size as their length.
         drawn_count: annotations that are drawn.
     """
 
@@ -119,8 +109,7 @@ class Pmi:
     dimensions: tuple[PmiRequirement, ...]
     tolerances: tuple[PmiRequirement, ...]
     datums: Mapping[str, tuple[tuple[PmiShape, ...], ...]]
-    targets: tuple[PmiTarget, ...]
-    ambiguous: tuple[str, ...]
+    targets: Mapping[str, PmiShape]
     drawn_count: int
 
 
@@ -137,92 +126,61 @@ def read_pmi(path: str | Path) -> Pmi:
         data = checked_text(unpacked(path), path)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
-    numbers, ambiguous = _faces_of_datums(data)
     size_mb = len(data) / 1e6
     with tempfile.TemporaryDirectory(prefix="arview-pmi-") as name:
-        folder = Path(name)
-        source, items, target = folder / "source.step", folder / "items.json", folder / "pmi.json"
+        source, items, target = (Path(name) / file for file in ("source.step", "items.json", "pmi.json"))
         source.write_bytes(data)
-        items.write_text(json.dumps(numbers), encoding="utf-8")
-        code, _ = run_limited(_READ, [str(source), str(items), str(target)], folder, size_mb, LIMITS)
+        items.write_text(json.dumps(_faces_of_datums(data)), encoding="utf-8")
+        code, _ = run_limited(_READ, [str(source), str(items), str(target)], Path(name), size_mb, LIMITS)
         if code or not target.is_file():
             raise InputError(f"{path}: OpenCASCADE cannot read its PMI (code {code}); is it whole? Export it again")
         content = json.loads(target.read_text(encoding="utf-8"))
-    bounds = _bounds_of_file(data)
+    measures = {match[1]: float(match[2]) for match in _MEASURE.finditer(data)}
+    bounds = [(measures.get(match[1], 0.0), measures.get(match[2], 0.0)) for match in _BOUNDS.finditer(data)]
     return Pmi(
         counts=tuple(content["counts"]),
-        dimensions=tuple(
-            _requirement(one, bounds)
-            for one in content["dimensions"]
-            if one["kind"] not in ("CommonLabel", "DimensionPresentation")
-        ),
+        dimensions=tuple(_requirement(one, bounds) for one in content["dimensions"] if one["kind"] not in _ONLY_DRAWN),
         tolerances=tuple(_requirement(one, bounds) for one in content["tolerances"]),
-        datums={
-            letter: tuple(tuple(map(_shape, shapes)) for shapes in places)
-            for letter, places in content["datums"].items()
-        },
-        targets=tuple(
-            PmiTarget(one["letter"], one["number"], one["kind"], _rounded(one["point"]), _rounded(one["direction"], 9))
-            for one in content["targets"]
-        ),
-        ambiguous=ambiguous,
+        datums={letter: tuple(map(_shapes, places)) for letter, places in content["datums"].items()},
+        targets={name: _shapes([one])[0] for name, one in sorted(content["targets"].items())},
         drawn_count=len(_DRAWN.findall(data)),
     )
 
 
-def _faces_of_datums(data: bytes) -> tuple[dict[str, list[str]], tuple[str, ...]]:
-    """Numbers of the faces of each datum by its letter, and letters that several parts use.
-
-    The faces are used by the datum, by the feature that is related to it, or by the parts of that feature.
-    """
+def _faces_of_datums(data: bytes) -> dict[str, list[str]]:
+    """Numbers of the faces of each datum by its letter: of the datum, its feature, and the parts of that feature."""
     used: dict[bytes, list[bytes]] = {}
     related: list[tuple[bytes, bytes]] = []
-    datums: list[tuple[bytes, bytes, str]] = []
+    datums: list[tuple[bytes, str]] = []
     for number, kind, content in _STATEMENT.findall(data):
         first, *rest = references(content) or [b""]
         if kind == b"DATUM":
-            datums.append((number, first, content.rpartition(b"'")[0].rpartition(b"'")[2].decode("utf-8", "replace")))
+            datums.append((number, content.rpartition(b"'")[0].rpartition(b"'")[2].decode("utf-8", errors="replace")))
         elif kind == b"SHAPE_ASPECT_RELATIONSHIP":
             related += [(first, part) for part in rest[:1]]
         else:
             used.setdefault(first, []).extend(rest[1:])
-    parts: dict[bytes, list[bytes]] = {}
-    for whole, part in related:
-        parts.setdefault(whole, []).append(part)
     found: dict[str, list[str]] = {}
-    owners: dict[str, set[bytes]] = {}
-    for datum, owner, letter in datums:
-        features = [whole for whole, part in related if part == datum]
-        aspects = [datum, *features, *(part for whole in features for part in parts[whole])]
-        faces = [face.decode() for aspect in dict.fromkeys(aspects) for face in used.get(aspect, ())]
-        found[letter] = list(dict.fromkeys([*found.get(letter, ()), *faces]))
-        owners.setdefault(letter, set()).add(owner)
-    return found, tuple(letter for letter, parts_of in owners.items() if len(parts_of) > 1)
-
-
-def _bounds_of_file(data: bytes) -> list[tuple[float, float]]:
-    """Lower and upper bounds of the tolerances of dimensions, in the unit of the file."""
-    measures = {match[1]: float(match[2]) for match in _MEASURE.finditer(data)}
-    return [(measures.get(match[1], 0.0), measures.get(match[2], 0.0)) for match in _BOUNDS.finditer(data)]
+    for datum, letter in datums:
+        features = {whole for whole, part in related if part == datum}
+        aspects = [datum, *features, *(part for whole, part in related if whole in features)]
+        found.setdefault(letter, []).extend(
+            face.decode() for one in dict.fromkeys(aspects) for face in used.get(one, ())
+        )
+    return {letter: list(dict.fromkeys(faces)) for letter, faces in found.items()}
 
 
 def _requirement(content: Mapping[str, Any], bounds: Sequence[tuple[float, float]]) -> PmiRequirement:
-    values, limits = content["values"], None
-    value = values[0] if values else None
-    if content.get("is_range"):
-        limits = (values[0], values[1])
-        value = 0.5 * sum(limits)
-    elif content.get("is_plus_minus") and len(values) == 3:
-        limits = _limits(*values, bounds)
+    value, *rest = [round(number, 6) for number in content["values"]] or [None]
     return PmiRequirement(
-        name=content["name"],
-        kind=content["kind"],
-        shapes=tuple(map(_shape, content["shapes"])),
-        others=tuple(map(_shape, content["others"])),
-        value_mm=None if value is None else round(value, 6),
-        limits_mm=limits,
+        content["name"],
+        content["kind"],
+        _shapes(content["shapes"]),
+        _shapes(content["others"]),
+        value_mm=value,
+        limits_mm=(value, rest[0]) if len(rest) == 1 else _limits(value, *rest, bounds) if rest else None,
         zone=content.get("zone", "None"),
-        modifiers=(*content["modifiers"], *(["class of tolerance"] if content.get("is_class") else [])),
+        modifiers=tuple(content["modifiers"]),
         datums=tuple((letter, order, tuple(words)) for letter, order, words in content.get("datums", ())),
         place=content["place"],
     )
@@ -234,30 +192,17 @@ def _limits(value: float, low: float, high: float, bounds: Sequence[tuple[float,
     Their signs are those of the bounds of the file with the same ratio; None where these differ.
     """
     signs = {
-        (-1.0 if one < 0 else 1.0, -1.0 if other < 0 else 1.0)
+        (one < 0, other < 0)
         for one, other in bounds
-        if one and other and abs(abs(one) * high - abs(other) * low) <= 1e-6 * max(abs(one) * high, abs(other) * low)
+        if one and other and abs(abs(one) * high - abs(other) * low) <= 1e-5 * abs(other) * low
     }
-    if len(signs) > 1:
-        return None
-    below, above = signs.pop() if signs else (-1.0, 1.0)
-    return round(value + below * low, 6), round(value + above * high, 6)
+    is_below, is_above_below = signs.pop() if signs else (True, False)
+    limits = (round(value + (-low if is_below else low), 6), round(value + (-high if is_above_below else high), 6))
+    return None if signs else limits
 
 
-def _shape(content: Mapping[str, Any]) -> PmiShape:
-    corner = content["corner"]
-    return PmiShape(
-        content["kind"],
-        _rounded(content["point"]),
-        _rounded(content.get("direction", (0.0, 0.0, 0.0)), 9),
-        diameter_mm=round(content.get("diameter", 0.0), 6),
-        length_mm=round(content.get("length", 0.0), 6),
-        area_mm2=content.get("area", 0.0),
-        is_hole=content.get("is_hole", False),
-        corner_in_model=None if corner is None else _rounded(corner),
+def _shapes(contents: Sequence[Mapping[str, Any]]) -> tuple[PmiShape, ...]:
+    return tuple(
+        PmiShape(**{key: tuple(value) if isinstance(value, list) else value for key, value in content.items()})
+        for content in contents
     )
-
-
-def _rounded(values: Sequence[float], digits: int = 6) -> Vector:
-    x, y, z = (round(value, digits) + 0.0 for value in values)
-    return x, y, z
