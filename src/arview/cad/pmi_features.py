@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import count
+from functools import cache
+from itertools import chain, count
 
 import numpy as np
 from trimesh.triangles import closest_point
@@ -21,23 +22,26 @@ SAME_MM, SAME_SINE = 1e-3, 1e-4
 """Differences of place and direction below which faces lie on one plane or cylinder."""
 ACROSS_COSINE = 0.9
 """Cosine of the angle between a normal of a surface and that of the triangles that stand for it."""
+TARGETS = ("point", "circle", "rectangle", "area")
+"""Kinds of datum targets for which a point or plane stands."""
 MIN_TURN = 0.5
 """Share of its circumference that a round face has at least; less is the end of a slot, or a fillet."""
 
 
 class PmiFeatures:
-    """The features of a part that were asked for, each once, in ``found``."""
+    """The features of a part that were asked for, without their labels, and ``labels`` of each."""
 
     def __init__(self, part: Part) -> None:
         self.part = part
-        self.found: list[Datum] = []
+        self.labels: dict[Datum, str] = {}
+        self._rims = cache(lambda name: find_rims(part.model.component(name)))
+        vertices, faces, self._ids = part.model.mesh
+        self._corners = vertices[faces]
+        crossed = np.cross(self._corners[:, 1] - self._corners[:, 0], self._corners[:, 2] - self._corners[:, 0])
+        self._normals = crossed / np.maximum(np.linalg.norm(crossed, axis=1, keepdims=True), 1e-300)
 
-    def of(self, shapes: Sequence[PmiShape], label: str = "") -> list[Datum]:
+    def of(self, shapes: Sequence[PmiShape]) -> list[Datum]:
         """The features that some shapes are: faces of one plane or cylinder are one.
-
-        Args:
-            shapes: faces and edges.
-            label: of a feature that was not asked for before; empty: its kind and a number.
 
         Raises:
             InputError: a shape that is no feature of a part file, or lies on no component.
@@ -45,72 +49,65 @@ class PmiFeatures:
         groups: list[list[PmiShape]] = []
         for shape in shapes:
             same = [group for group in groups if any(_is_same(shape, other) for other in group)]
-            groups = [group for group in groups if group not in same] + [[*sum(same, []), shape]]
-        return [self._labelled(self._feature(group), label) for group in groups]
+            groups = [group for group in groups if group not in same] + [[*chain(*same), shape]]
+        return [self.labelled(self._feature(group)) for group in groups]
 
-    def at(self, target: PmiShape, label: str, is_plane: bool) -> Datum:
+    def at(self, target: PmiShape, is_plane: bool) -> Datum:
         """The point feature of a datum target; of an area the plane on which it lies; raises InputError as `of`."""
-        point, direction = np.array(target.point_in_model), np.array(target.direction_in_model)
-        reach_mm = target.length_mm if is_plane else ON_SURFACE_MM
-        component, normal = self._surface(point, direction if is_plane else None, reach_mm)
-        feature = Datum("", "plane" if is_plane else "point", component, _vector(point), _vector(normal))
-        return self._labelled(feature, label)
+        if target.kind not in TARGETS:
+            raise InputError(f"its targets are of the kind {target.kind}; a part file has points")
+        point, direction = np.array(target.point_in_model), np.array(target.direction_in_model) if is_plane else None
+        component, normal = self._surface(point, direction, target.length_mm if is_plane else ON_SURFACE_MM)
+        return Datum("", "plane" if is_plane else "point", component, _vector(point), _vector(normal))
 
-    def _labelled(self, feature: Datum, label: str) -> Datum:
-        known = next((other for other in self.found if replace(other, label="") == feature), None)
-        if known is None:
-            taken = {*(one.label for one in self.found), *(one.name for one in self.part.model.components)}
-            names = (f"{feature.feature}_{number}" for number in count(1))
-            known = replace(feature, label=label or next(name for name in names if name not in taken))
-            self.found.append(known)
-        return known
+    def labelled(self, feature: Datum, label: str = "") -> Datum:
+        """A feature with a given label, else with the one that it has, else with its kind and a number."""
+        key = replace(feature, label="")
+        taken = {*self.labels.values(), *(component.name for component in self.part.model.components)}
+        names = (f"{feature.feature}_{number}" for number in count(1))
+        self.labels[key] = label or self.labels.get(key) or next(name for name in names if name not in taken)
+        return replace(key, label=self.labels[key])
 
     def _feature(self, group: list[PmiShape]) -> Datum:
         """The feature of the faces of one plane or cylinder, or of an edge, without a label."""
         first, kind = group[0], group[0].kind
-        if kind not in ("plane", "edge", "cylinder"):
+        if kind not in ("plane", "cylinder", "line edge"):
             raise InputError(f"a {kind} is no feature of a part file")
-        point, axis = np.array(first.point_in_model), np.array(first.direction_in_model)
-        corner = np.array(first.corner_in_model)
+        point, axis, corner = map(np.array, (first.point_in_model, first.direction_in_model, first.corner_in_model))
         radial = corner - point - ((corner - point) @ axis) * axis
         radial *= (-1.0 if first.is_hole else 1.0) / max(float(np.linalg.norm(radial)), 1e-9)
         component, _ = self._surface(corner, {"plane": axis, "cylinder": radial}.get(kind))
-        middles = np.array([shape.point_in_model for shape in group])
-        areas = np.array([shape.area_mm2 for shape in group])
+        middles, areas = np.array([one.point_in_model for one in group]), np.array([one.area_mm2 for one in group])
         if kind != "cylinder":
             middle = np.average(middles, axis=0, weights=np.maximum(areas, 1e-9))
             return Datum("", "plane" if kind == "plane" else "edge", component, _vector(middle), _vector(axis))
         along = (middles - point) @ axis + np.outer([-0.5, 0.5], [shape.length_mm for shape in group])
-        ends = point + np.outer([along.min(), along.max()], axis)
         turn = areas.sum() / max(np.pi * first.diameter_mm * float(np.ptp(along)), 1e-9)
         if turn < MIN_TURN:
             raise InputError(f"a round face over {360 * turn:.0f}° only is no feature of a part file")
-        rims = [
-            (float(end["xyz".index(self.part.up[-1])]), end, outward)
-            for end, outward in zip(ends, (-axis, axis), strict=True)
-            for rim in find_rims(self.part.model.component(component))
-            if np.linalg.norm(rim.center_in_model - end) <= ON_SURFACE_MM
+        ends = [(point + along.min() * axis, -axis), (point + along.max() * axis, axis)]
+        ends.sort(key=lambda end: end[0]["xyz".index(self.part.up[-1])], reverse="-" not in self.part.up)
+        with_rim = [
+            end
+            for end in ends
+            for rim in self._rims(component)
+            if np.linalg.norm(rim.center_in_model - end[0]) <= ON_SURFACE_MM
             and abs(rim.radius_mm - 0.5 * first.diameter_mm) <= ON_SURFACE_MM
         ]
-        place = (max if "-" not in self.part.up else min)(rims, key=lambda rim: rim[0], default=(0.0, ends[0], axis))
-        round_kind = "cylinder" if not rims else "hole" if first.is_hole else "pin"
-        return Datum("", round_kind, component, _vector(place[1]), _vector(place[2]), first.diameter_mm)
+        round_kind = "cylinder" if not with_rim else "hole" if first.is_hole else "pin"
+        place, outward = [*with_rim, *ends][0]
+        return Datum("", round_kind, component, _vector(place), _vector(outward), first.diameter_mm)
 
     def _surface(self, point: Array, normal: Array | None, reach_mm: float = ON_SURFACE_MM) -> tuple[str, Array]:
         """Component and normal (3,) of the triangle nearest to a point, where a normal is given across that."""
-        vertices, faces, ids = self.part.model.mesh
-        a, b, c = vertices[faces].transpose(1, 0, 2)
-        normals = np.cross(b - a, c - a)
-        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
-        is_near = np.abs(np.einsum("ij,ij->i", normals, point - a)) <= ON_SURFACE_MM
-        if normal is not None:
-            is_near &= normals @ normal > ACROSS_COSINE
-        near = np.stack([a, b, c], axis=1)[is_near]
+        is_near = np.abs(np.einsum("ij,ij->i", self._normals, point - self._corners[:, 0])) <= ON_SURFACE_MM
+        is_near &= True if normal is None else self._normals @ normal > ACROSS_COSINE
+        near = self._corners[is_near]
         distances = np.linalg.norm(closest_point(near, np.tile(point, (len(near), 1))) - point, axis=1)
         if distances.min(initial=np.inf) > reach_mm:
             raise InputError("it lies on no component; it may be drawn beside the body, or its component is left out")
-        nearest = int(np.argmin(distances))
-        return self.part.model.components[ids[is_near][nearest]].name, normals[is_near][nearest]
+        nearest = np.flatnonzero(is_near)[np.argmin(distances)]
+        return self.part.model.components[self._ids[nearest]].name, self._normals[nearest]
 
 
 def _is_same(one: PmiShape, other: PmiShape) -> bool:

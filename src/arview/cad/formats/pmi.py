@@ -15,21 +15,21 @@ from typing import Any
 
 from arview.cad.formats.archive import unpacked
 from arview.cad.formats.limited_process import ProcessLimits, run_limited
-from arview.cad.formats.step_statements import references
+from arview.cad.formats.step_statements import edited, references
 from arview.cad.formats.step_text import checked_text
 from arview.cad.part import Vector
 from arview.core.extras import require
 from arview.errors import InputError
 
 LIMITS = ProcessLimits(cpu_s=15.0, memory_mb=3000.0)
-_STATEMENT = re.compile(
+_LINK = re.compile(
     rb"#(\d+)\s*=\s*(DATUM|SHAPE_ASPECT_RELATIONSHIP|GEOMETRIC_ITEM_SPECIFIC_USAGE|ITEM_IDENTIFIED_REPRESENTATION_USAGE)"
     rb"\s*\(((?:'[^']*'|[^;'])*)\)\s*;"
 )
+"""Statements that say of which faces datums are."""
 _DRAWN = re.compile(rb"=\s*\(?\s*(?:TESSELLATED_)?ANNOTATION(?:_CURVE|_FILL_AREA|_SYMBOL|_TEXT)?_OCCURRENCE\b")
 _BOUNDS = re.compile(rb"=\s*TOLERANCE_VALUE\s*\(\s*#(\d+)\s*,\s*#(\d+)\s*\)")
 _MEASURE = re.compile(rb"#(\d+)\s*=\s*\(?[^;]*?MEASURE\s*\(\s*([-+.\dE]+)\s*\)")
-_ONLY_DRAWN = ("CommonLabel", "DimensionPresentation")
 _READ = """
 from arview.cad.formats.pmi_document import write_pmi
 write_pmi(*sys.argv[1:])
@@ -41,7 +41,7 @@ class PmiShape:
     """A face or edge at its place in the model, mm.
 
     Attributes:
-        kind: plane, cylinder, edge (a straight one), or the name of another surface or curve.
+        kind: plane, cylinder, line edge, vertex, or the name of another surface or curve.
         point_in_model: middle of a face or edge; of a cylinder on its axis; the place of a vertex.
         direction_in_model: unit normal out of the material, or unit axis; zero for other surfaces.
         diameter_mm: of a cylinder.
@@ -75,8 +75,7 @@ class PmiRequirement:
         limits_mm: smallest and largest value of a dimension; None where the file has none.
         zone: None, Diameter or SphericalDiameter.
         modifiers: names of all that changes its meaning: M, L, All_Around, Free_State, theoretical, ….
-        datums: letter, number in the order of precedence, and modifiers of each datum, in that order.
-        place: of the part that carries it, from 0, where it stands at several places of the assembly.
+        datums: name (see `Pmi`), number in the order of precedence, and modifiers of each datum, in that order.
     """
 
     name: str
@@ -88,27 +87,31 @@ class PmiRequirement:
     zone: str = "None"
     modifiers: tuple[str, ...] = ()
     datums: tuple[tuple[str, int, tuple[str, ...]], ...] = ()
-    place: int = 0
 
 
 @dataclass(frozen=True)
 class Pmi:
     """What a STEP file says of the accuracy of its parts.
 
+    What a part requires that stands at several places of an assembly is there once for each place.
+
     Attributes:
         counts: of dimensions (drawn ones, too), geometric tolerances, and references to datums in the file.
-        dimensions: with a meaning, in the order of the file, once for each place of their part.
-        tolerances: as ``dimensions``.
-        datums: shapes of the feature of each datum by its letter, for each place of its part.
+        drawn_dimensions: how many of the dimensions are only drawn; they are left out of ``dimensions``.
+        dimensions: in the order of the file.
+        tolerances: in the order of the file.
+        datums: shapes of the feature of each datum by its name: its letter, and at the further places of its part
+            A_2, A_3, ….
         targets: datum targets by letter and number, as in B2: kind (point, line, circle, …), middle, direction across
             the surface (of a line along it), and size as their length.
         drawn_count: annotations that are drawn.
     """
 
     counts: tuple[int, int, int]
+    drawn_dimensions: int
     dimensions: tuple[PmiRequirement, ...]
     tolerances: tuple[PmiRequirement, ...]
-    datums: Mapping[str, tuple[tuple[PmiShape, ...], ...]]
+    datums: Mapping[str, tuple[PmiShape, ...]]
     targets: Mapping[str, PmiShape]
     drawn_count: int
 
@@ -122,52 +125,47 @@ def read_pmi(path: str | Path) -> Pmi:
     """
     path = Path(path)
     require(f"{path}: PMI", "OCP")
-    try:
-        data = checked_text(unpacked(path), path)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
-    size_mb = len(data) / 1e6
+    data = checked_text(unpacked(path), path)
     with tempfile.TemporaryDirectory(prefix="arview-pmi-") as name:
-        source, items, target = (Path(name) / file for file in ("source.step", "items.json", "pmi.json"))
-        source.write_bytes(data)
-        items.write_text(json.dumps(_faces_of_datums(data)), encoding="utf-8")
-        code, _ = run_limited(_READ, [str(source), str(items), str(target)], Path(name), size_mb, LIMITS)
+        source, target = Path(name) / "source.step", Path(name) / "pmi.json"
+        source.write_bytes(_with_faces_of_datums(data))
+        code, _ = run_limited(_READ, [str(source), str(target)], Path(name), len(data) / 1e6, LIMITS)
         if code or not target.is_file():
             raise InputError(f"{path}: OpenCASCADE cannot read its PMI (code {code}); is it whole? Export it again")
         content = json.loads(target.read_text(encoding="utf-8"))
     measures = {match[1]: float(match[2]) for match in _MEASURE.finditer(data)}
     bounds = [(measures.get(match[1], 0.0), measures.get(match[2], 0.0)) for match in _BOUNDS.finditer(data)]
     return Pmi(
-        counts=tuple(content["counts"]),
-        dimensions=tuple(_requirement(one, bounds) for one in content["dimensions"] if one["kind"] not in _ONLY_DRAWN),
-        tolerances=tuple(_requirement(one, bounds) for one in content["tolerances"]),
-        datums={letter: tuple(map(_shapes, places)) for letter, places in content["datums"].items()},
+        tuple(content["counts"]),
+        content["drawn_dimensions"],
+        tuple(_requirement(one, bounds) for one in content["dimensions"]),
+        tuple(_requirement(one, bounds) for one in content["tolerances"]),
+        datums={name: _shapes(shapes) for name, shapes in content["datums"].items()},
         targets={name: _shapes([one])[0] for name, one in sorted(content["targets"].items())},
         drawn_count=len(_DRAWN.findall(data)),
     )
 
 
-def _faces_of_datums(data: bytes) -> dict[str, list[str]]:
-    """Numbers of the faces of each datum by its letter: of the datum, its feature, and the parts of that feature."""
-    used: dict[bytes, list[bytes]] = {}
-    related: list[tuple[bytes, bytes]] = []
-    datums: list[tuple[bytes, str]] = []
-    for number, kind, content in _STATEMENT.findall(data):
-        first, *rest = references(content) or [b""]
-        if kind == b"DATUM":
-            datums.append((number, content.rpartition(b"'")[0].rpartition(b"'")[2].decode("utf-8", errors="replace")))
-        elif kind == b"SHAPE_ASPECT_RELATIONSHIP":
-            related += [(first, part) for part in rest[:1]]
-        else:
-            used.setdefault(first, []).extend(rest[1:])
-    found: dict[str, list[str]] = {}
-    for datum, letter in datums:
-        features = {whole for whole, part in related if part == datum}
-        aspects = [datum, *features, *(part for whole, part in related if whole in features)]
-        found.setdefault(letter, []).extend(
-            face.decode() for one in dict.fromkeys(aspects) for face in used.get(one, ())
+def _with_faces_of_datums(data: bytes) -> bytes:
+    """The file with a statement for each face of a datum, in the form in which alone OpenCASCADE links them.
+
+    Writers link faces to the datum itself, or as a set to the feature that is related to it.
+    """
+    rows = [(number, kind, references(content)) for number, kind, content in _LINK.findall(data)]
+    datums = {number for number, kind, _ in rows if kind == b"DATUM"}
+    related = [items for _, kind, items in rows if kind == b"SHAPE_ASPECT_RELATIONSHIP" and items[-1] in datums]
+    contents = [
+        b"('','',#%s,#%s,#%s);" % (feature, representation, face)
+        for _, kind, (aspect, representation, *faces) in (
+            row for row in rows if row[1].endswith(b"USAGE") and row[2][1:]
         )
-    return {letter: list(dict.fromkeys(faces)) for letter, faces in found.items()}
+        for feature, datum in (items for items in related if len(items) == 2)
+        if aspect == datum or (aspect == feature and kind.startswith(b"ITEM"))
+        for face in faces
+    ]
+    first = 1 + max(map(int, re.findall(rb"#(\d+)\s*=", data)), default=0)
+    added = [b"#%d=GEOMETRIC_ITEM_SPECIFIC_USAGE%s\n" % (first + k, content) for k, content in enumerate(contents)]
+    return edited(data, {(data.rfind(b"ENDSEC"),) * 2: b"".join(added)})
 
 
 def _requirement(content: Mapping[str, Any], bounds: Sequence[tuple[float, float]]) -> PmiRequirement:
@@ -181,8 +179,7 @@ def _requirement(content: Mapping[str, Any], bounds: Sequence[tuple[float, float
         limits_mm=(value, rest[0]) if len(rest) == 1 else _limits(value, *rest, bounds) if rest else None,
         zone=content.get("zone", "None"),
         modifiers=tuple(content["modifiers"]),
-        datums=tuple((letter, order, tuple(words)) for letter, order, words in content.get("datums", ())),
-        place=content["place"],
+        datums=tuple((name, order, tuple(words)) for name, order, words in content["datums"]),
     )
 
 
@@ -196,9 +193,9 @@ def _limits(value: float, low: float, high: float, bounds: Sequence[tuple[float,
         for one, other in bounds
         if one and other and abs(abs(one) * high - abs(other) * low) <= 1e-5 * abs(other) * low
     }
-    is_below, is_above_below = signs.pop() if signs else (True, False)
-    limits = (round(value + (-low if is_below else low), 6), round(value + (-high if is_above_below else high), 6))
-    return None if signs else limits
+    is_below, is_all_below = next(iter(signs), (True, False))
+    limits = (round(value + (-low if is_below else low), 6), round(value + (-high if is_all_below else high), 6))
+    return None if len(signs) > 1 else limits
 
 
 def _shapes(contents: Sequence[Mapping[str, Any]]) -> tuple[PmiShape, ...]:

@@ -1,7 +1,4 @@
-"""Dimensions, tolerances and datums that OpenCASCADE finds in a STEP file (AP242), as JSON; for a limited process.
-
-OpenCASCADE links dimensions and tolerances to faces, but few datums; those come as numbers of STEP statements.
-"""
+"""Dimensions, tolerances and datums that OpenCASCADE finds in a STEP file (AP242), as JSON; for a limited process."""
 
 from __future__ import annotations
 
@@ -23,7 +20,6 @@ from OCP.TCollection import TCollection_ExtendedString
 from OCP.TDocStd import TDocStd_Document
 from OCP.TopAbs import TopAbs_Orientation, TopAbs_ShapeEnum
 from OCP.TopExp import TopExp
-from OCP.TopLoc import TopLoc_Location
 from OCP.TopoDS import TopoDS
 from OCP.XCAFDoc import (
     XCAFDoc_Datum,
@@ -34,53 +30,62 @@ from OCP.XCAFDoc import (
     XCAFDoc_ShapeTool,
 )
 
-NOT_READ = 3
-"""Exit code of the process where OpenCASCADE cannot read the file."""
 FACE, EDGE, VERTEX = TopAbs_ShapeEnum.TopAbs_FACE, TopAbs_ShapeEnum.TopAbs_EDGE, TopAbs_ShapeEnum.TopAbs_VERTEX
+REVERSED = TopAbs_Orientation.TopAbs_REVERSED
+DRAWN = ("CommonLabel", "DimensionPresentation")
+"""Kinds of dimensions that are annotations without a meaning."""
 Places = dict[Any, list[Any]]
 """Each face and edge of the bodies, as often as it is placed."""
 
 
-def write_pmi(source: str, items: str, target: str) -> None:
-    """Write what is in a STEP file as JSON and end the process, with `NOT_READ` where it cannot be read.
+def write_pmi(source: str, target: str) -> None:
+    """Write what is in a STEP file as JSON and end the process.
 
     Args:
         source: the STEP file.
-        items: JSON file of the faces of datums, as numbers of STEP statements, by letter.
         target: JSON file to write; its keys are the fields of `arview.cad.formats.pmi.Pmi`.
+
+    Raises:
+        ValueError: OpenCASCADE cannot read the file.
     """
     reader = STEPCAFControl_Reader()
     reader.SetGDTMode(True)
     document = TDocStd_Document(TCollection_ExtendedString("pmi"))
     if reader.ReadFile(source) != IFSelect_ReturnStatus.IFSelect_RetDone or not reader.Transfer(document):
-        os._exit(NOT_READ)
-    content = _content(reader, document.Main(), json.loads(Path(items).read_text(encoding="utf-8")))
-    Path(target).write_text(json.dumps(content), encoding="utf-8")
+        raise ValueError("OpenCASCADE cannot read it")
+    Path(target).write_text(json.dumps(_content(document.Main())), encoding="utf-8")
     os._exit(0)  # OpenCASCADE takes seconds to free a large document
 
 
-def _content(reader: Any, main: Any, faces_of_datum: dict[str, list[str]]) -> dict[str, Any]:
+def _content(main: Any) -> dict[str, Any]:
     tool = XCAFDoc_DocumentTool.DimTolTool_s(main)
     roots = _labels(XCAFDoc_DocumentTool.ShapeTool_s(main).GetFreeShapes)
     dimensions, tolerances = _labels(tool.GetDimensionLabels), _labels(tool.GetGeomToleranceLabels)
-    datums = [XCAFDoc_Datum.Set_s(label).GetObject() for label in _labels(tool.GetDatumLabels)]
+    references = [(label, XCAFDoc_Datum.Set_s(label).GetObject()) for label in _labels(tool.GetDatumLabels)]
     places: Places = {}
     for kind in (FACE, EDGE):
         for shape in _parts(map(XCAFDoc_ShapeTool.GetShape_s, roots), kind):
             places.setdefault(shape.TShape(), []).append(shape)
+    datums: dict[str, list[dict[str, Any]]] = {}
+    for label, reference in references:
+        for placed in _at_places(label, places, {"datums": [[_text(reference.GetName())]]}):
+            known = datums.setdefault(placed["datums"][0][0], [])
+            known += [shape for shape in placed["shapes"] if shape not in known]
+    meant = [label for label in dimensions if _word(XCAFDoc_Dimension.Set_s(label).GetObject().GetType()) not in DRAWN]
     return {
-        "counts": [len(dimensions), len(tolerances), len(datums)],
-        "dimensions": [one for label in dimensions for one in _at_places(label, places, _dimension(label))],
+        "counts": [len(dimensions), len(tolerances), len(references)],
+        "drawn_dimensions": len(dimensions) - len(meant),
+        "dimensions": [one for label in meant for one in _at_places(label, places, _dimension(label))],
         "tolerances": [one for label in tolerances for one in _at_places(label, places, _tolerance(label))],
-        "datums": _datums(reader.Reader().WS(), places, faces_of_datum),
+        "datums": datums,
         "targets": {
-            f"{one.GetName().ToCString()}{one.GetDatumTargetNumber()}": {
+            f"{_text(one.GetName())}{one.GetDatumTargetNumber()}": {
                 "kind": _word(one.GetDatumTargetType()).lower(),
                 "point_in_model": _numbers(one.GetDatumTargetAxis().Location()),
                 "direction_in_model": _numbers(one.GetDatumTargetAxis().Direction(), 9),
                 "length_mm": one.GetDatumTargetLength(),
             }
-            for one in datums
+            for _, one in references
             if one.IsDatumTarget()
         },
     }
@@ -120,7 +125,7 @@ def _tolerance(label: Any) -> dict[str, Any]:
 
 
 def _at_places(label: Any, places: Places, own: dict[str, Any]) -> list[dict[str, Any]]:
-    """A requirement with its shapes, once for each place of the part that carries it."""
+    """A requirement with its shapes, once for each place of its part, from the second on with datums A_2, A_3, …"""
     sides = Sequence_TDF_Label(), Sequence_TDF_Label()
     XCAFDoc_DimTolTool.GetRefShapeLabel_s(label, *sides)
     shapes = [[XCAFDoc_ShapeTool.GetShape_s(one) for one in _items(side)] for side in sides]
@@ -128,30 +133,10 @@ def _at_places(label: Any, places: Places, own: dict[str, Any]) -> list[dict[str
     counts = {len(found) for side in placed for found in side}
     return [
         own
-        | {"place": k, "shapes": [_described(one[k]) for one in placed[0]]}
-        | {"others": [_described(one[k]) for one in placed[1]]}
+        | {"shapes": [_described(one[k]) for one in placed[0]], "others": [_described(one[k]) for one in placed[1]]}
+        | {"datums": [[f"{letter}_{k + 1}" if k else letter, *rest] for letter, *rest in own.get("datums", ())]}
         for k in range(max(counts) if len(counts) == 1 else 1)
     ]
-
-
-def _datums(session: Any, places: Places, faces_of_datum: dict[str, list[str]]) -> dict[str, list[Any]]:
-    """Shapes of the datum features by letter, for each place of the part that carries them."""
-    model, results = session.Model(), session.TransferReader()
-    # An entity is found by its identity, because the model does not give back the number of its statement.
-    numbers = dict.fromkeys(number for faces in faces_of_datum.values() for number in faces)
-    entities = {model.Entity(model.NextNumberForLabel(f"#{number}", 0, True)): number for number in numbers}
-    found: dict[str, list[Any]] = {}
-    for shapes in places.values():  # faces come first; each search takes a millisecond
-        if len(found) == len(entities):
-            break
-        entity = results.EntityFromShapeResult(shapes[0].Located(TopLoc_Location()), 1)
-        if entity in entities:
-            found[entities[entity]] = shapes
-    placed = {letter: [found[one] for one in faces if one in found] for letter, faces in faces_of_datum.items()}
-    return {
-        letter: [list(map(_described, shapes)) for shapes in zip(*faces, strict=False)]
-        for letter, faces in placed.items()
-    }
 
 
 def _described(shape: Any) -> dict[str, Any]:
@@ -160,32 +145,29 @@ def _described(shape: Any) -> dict[str, Any]:
     own: dict[str, Any] = {"kind": "vertex", "point_in_model": corner, "corner_in_model": corner}
     if shape.ShapeType() == EDGE:
         curve = BRepAdaptor_Curve(TopoDS.Edge(shape))
-        first, last, kind = curve.FirstParameter(), curve.LastParameter(), _word(curve.GetType()).lower()
-        own |= {"kind": f"{kind} edge", "point_in_model": _numbers(curve.Value(0.5 * (first + last)))}
-        if kind == "line":
-            own |= {"kind": "edge", "direction_in_model": _numbers(curve.Line().Direction(), 9)}
-    elif shape.ShapeType() == FACE:
-        surface, properties = BRepAdaptor_Surface(TopoDS.Face(shape)), GProp_GProps()
-        BRepGProp.SurfaceProperties_s(shape, properties)
-        is_turned = shape.Orientation() == TopAbs_Orientation.TopAbs_REVERSED
-        own |= {"kind": _word(surface.GetType()).lower(), "point_in_model": _numbers(properties.CentreOfMass())}
-        own["area_mm2"] = properties.Mass()
-        if own["kind"] == "plane":
-            axes = surface.Plane().Position()
-            outward = axes.Direction() if axes.Direct() != is_turned else axes.Direction().Reversed()
-            own["direction_in_model"] = _numbers(outward, 9)
-        elif own["kind"] == "cylinder":
-            cylinder, axis = surface.Cylinder(), surface.Cylinder().Axis()
-            low, high = surface.FirstVParameter(), surface.LastVParameter()
-            middle = cylinder.Location().Translated(gp_Vec(axis.Direction()).Multiplied(0.5 * (low + high)))
-            own |= {
-                "point_in_model": _numbers(middle),
-                "direction_in_model": _numbers(axis.Direction(), 9),
-                "diameter_mm": round(2.0 * cylinder.Radius(), 6),
-                "length_mm": high - low,
-                "is_hole": cylinder.Position().Direct() == is_turned,
-            }
-    return own
+        kind, middle = _word(curve.GetType()).lower(), 0.5 * (curve.FirstParameter() + curve.LastParameter())
+        own |= {"kind": f"{kind} edge", "point_in_model": _numbers(curve.Value(middle))}
+        return own | ({"direction_in_model": _numbers(curve.Line().Direction(), 9)} if kind == "line" else {})
+    if shape.ShapeType() != FACE:
+        return own
+    surface, properties = BRepAdaptor_Surface(TopoDS.Face(shape)), GProp_GProps()
+    BRepGProp.SurfaceProperties_s(shape, properties)
+    own |= {"point_in_model": _numbers(properties.CentreOfMass()), "area_mm2": properties.Mass()}
+    own["kind"] = _word(surface.GetType()).lower()
+    if own["kind"] not in ("plane", "cylinder"):
+        return own
+    form = surface.Plane() if own["kind"] == "plane" else surface.Cylinder()
+    axis, is_inward = form.Axis().Direction(), form.Position().Direct() == (shape.Orientation() == REVERSED)
+    if own["kind"] == "plane":
+        return own | {"direction_in_model": _numbers(axis.Reversed() if is_inward else axis, 9)}
+    low, high = surface.FirstVParameter(), surface.LastVParameter()
+    return own | {
+        "point_in_model": _numbers(form.Location().Translated(gp_Vec(axis).Multiplied(0.5 * (low + high)))),
+        "direction_in_model": _numbers(axis, 9),
+        "diameter_mm": round(2.0 * form.Radius(), 6),
+        "length_mm": high - low,
+        "is_hole": is_inward,
+    }
 
 
 def _parts(shapes: Iterable[Any], kind: Any) -> list[Any]:
@@ -213,7 +195,8 @@ def _word(value: Any) -> str:
 
 
 def _text(value: Any) -> str:
-    return "" if value is None else str(value.ToCString())
+    """A text of OpenCASCADE without control characters."""
+    return "".join(letter if letter.isprintable() else " " for letter in ("" if value is None else value.ToCString()))
 
 
 def _numbers(point: Any, digits: int = 6) -> list[float]:
