@@ -12,7 +12,7 @@ from trimesh.triangles import closest_point
 
 from arview.cad.datum_check import find_rims
 from arview.cad.formats.pmi import PmiShape
-from arview.cad.part import Datum, Part
+from arview.cad.part import Datum, DatumFeature, Part
 from arview.errors import InputError
 from arview.geometry import Array
 
@@ -94,7 +94,7 @@ class PmiFeatures:
             if np.linalg.norm(rim.center_in_model - end[0]) <= ON_SURFACE_MM
             and abs(rim.radius_mm - 0.5 * first.diameter_mm) <= ON_SURFACE_MM
         ]
-        round_kind = "cylinder" if not with_rim else "hole" if first.is_hole else "pin"
+        round_kind: DatumFeature = "cylinder" if not with_rim else "hole" if first.is_hole else "pin"
         place, outward = [*with_rim, *ends][0]
         return Datum("", round_kind, component, _vector(place), _vector(outward), first.diameter_mm)
 

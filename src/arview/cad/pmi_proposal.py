@@ -116,6 +116,7 @@ class _Proposal:
             **({"datums": frame} if frame else {}),
             **({"at_maximum_material": True} if "M" in requirement.modifiers else {}),
         }
+        state = ", free state" if "Free_State" in requirement.modifiers else ""
         # The profile of one flat face without datums is its flatness.
         kind = "flatness" if kind == "profile" and not frame else kind
         for group in [[*features, *others]] if kind in ("position", "distance") else [[one] for one in features]:
@@ -127,7 +128,7 @@ class _Proposal:
                 "kind": kind,
                 "of": of if of[1:] else of[0],
                 **own,
-                "source": f"PMI of {self.file}: {name}{', free state' if 'Free_State' in requirement.modifiers else ''}",
+                "source": f"PMI of {self.file}: {name}{state}",
             }
 
     def _problem(
@@ -208,11 +209,11 @@ def _summary(pmi: Pmi, file: str, row_count: int) -> list[str]:
     dimensions, tolerances, references = pmi.counts
     if pmi.dimensions or tolerances:
         return [
-            f"PMI of {file}: {dimensions} dimensions ({pmi.drawn_dimensions} of them only drawn), {tolerances} geometric tolerances, "
-            f"{references} references to datums",
+            f"PMI of {file}: {dimensions} dimensions ({pmi.drawn_dimensions} of them only drawn), "
+            f"{tolerances} geometric tolerances, {references} references to datums",
             f"{row_count} characteristics are proposed; check them against the drawing",
         ]
-    drawn = f"only drawn, {pmi.drawn_count or dimensions} annotations for people to read; export semantic PMI (AP242)"
+    drawn = f"only drawn, {pmi.drawn_count or dimensions} annotations for people to read; export semantic PMI"
     none = "none; export AP242 with semantic PMI, or write the part file by hand"
     return [f"PMI of {file}: {drawn if pmi.drawn_count or dimensions else none}"]
 

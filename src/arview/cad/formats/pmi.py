@@ -29,7 +29,7 @@ _LINK = re.compile(
 """Statements that say of which faces datums are."""
 _DRAWN = re.compile(rb"=\s*\(?\s*(?:TESSELLATED_)?ANNOTATION(?:_CURVE|_FILL_AREA|_SYMBOL|_TEXT)?_OCCURRENCE\b")
 _BOUNDS = re.compile(rb"=\s*TOLERANCE_VALUE\s*\(\s*#(\d+)\s*,\s*#(\d+)\s*\)")
-_MEASURE = re.compile(rb"#(\d+)\s*=\s*\(?[^;]*?MEASURE\s*\(\s*([-+.\dE]+)\s*\)")
+_MEASURE = re.compile(rb"#(\d+)\s*=\s*\(?[^;]*?MEASURE(?:_WITH_UNIT)?\s*\(\s*([-+.\dE]+)\s*[,)]")
 _READ = """
 from arview.cad.formats.pmi_document import write_pmi
 write_pmi(*sys.argv[1:])
@@ -169,25 +169,29 @@ def _with_faces_of_datums(data: bytes) -> bytes:
 
 
 def _requirement(content: Mapping[str, Any], bounds: Sequence[tuple[float, float]]) -> PmiRequirement:
-    value, *rest = [round(number, 6) for number in content["values"]] or [None]
+    values = [round(number, 6) for number in content["values"]]
     return PmiRequirement(
         content["name"],
         content["kind"],
         _shapes(content["shapes"]),
         _shapes(content["others"]),
-        value_mm=value,
-        limits_mm=(value, rest[0]) if len(rest) == 1 else _limits(value, *rest, bounds) if rest else None,
+        value_mm=values[0] if values else None,
+        limits_mm=_limits(values, bounds),
         zone=content.get("zone", "None"),
         modifiers=tuple(content["modifiers"]),
         datums=tuple((name, order, tuple(words)) for name, order, words in content["datums"]),
     )
 
 
-def _limits(value: float, low: float, high: float, bounds: Sequence[tuple[float, float]]) -> tuple[float, float] | None:
-    """Limits of a dimension from the magnitudes of its bounds, which are all that OpenCASCADE keeps of them.
+def _limits(values: Sequence[float], bounds: Sequence[tuple[float, float]]) -> tuple[float, float] | None:
+    """Limits of a dimension: its two values, or its value and the bounds of its deviation.
 
-    Their signs are those of the bounds of the file with the same ratio; None where these differ.
+    OpenCASCADE keeps the magnitudes of bounds alone; their signs are those of the bounds of the file with the same
+    ratio. None where these differ, and of a dimension without limits.
     """
+    if len(values) != 3:
+        return (values[0], values[1]) if len(values) == 2 else None
+    value, low, high = values
     signs = {
         (one < 0, other < 0)
         for one, other in bounds
@@ -199,7 +203,8 @@ def _limits(value: float, low: float, high: float, bounds: Sequence[tuple[float,
 
 
 def _shapes(contents: Sequence[Mapping[str, Any]]) -> tuple[PmiShape, ...]:
-    return tuple(
-        PmiShape(**{key: tuple(value) if isinstance(value, list) else value for key, value in content.items()})
+    fields: list[dict[str, Any]] = [
+        {key: tuple(value) if isinstance(value, list) else value for key, value in content.items()}
         for content in contents
-    )
+    ]
+    return tuple(PmiShape(**field) for field in fields)
