@@ -79,8 +79,8 @@ class PmiFeatures:
         component, _ = self._surface(corner, {"plane": axis, "cylinder": radial}.get(kind))
         middles, areas = np.array([one.point_in_model for one in group]), np.array([one.area_mm2 for one in group])
         if kind != "cylinder":
-            middle = np.average(middles, axis=0, weights=np.maximum(areas, 1e-9))
-            return Datum("", "plane" if kind == "plane" else "edge", component, _vector(middle), _vector(axis))
+            point = np.average(middles, axis=0, weights=np.maximum(areas, 1e-9))
+            return Datum("", "plane" if kind == "plane" else "edge", component, _vector(point), _vector(axis))
         along = (middles - point) @ axis + np.outer([-0.5, 0.5], [shape.length_mm for shape in group])
         turn = areas.sum() / max(np.pi * first.diameter_mm * float(np.ptp(along)), 1e-9)
         if turn < MIN_TURN:

@@ -55,8 +55,8 @@ def propose_part(part: Part) -> str:
     datums = [one for found in proposal.datums.values() if not isinstance(found, str) for one in found]
     used = {name for row in rows for name in ([row["of"]] if isinstance(row["of"], str) else row["of"])}
     bases = {*(one.component for one in datums), *(names if len(names) == 1 else [])}
-    labels = used - {one.label for one in datums}
-    features = [replace(one, label=label) for one, label in proposal.features.labels.items() if label in labels]
+    used -= {one.label for one in datums}
+    features = [replace(one, label=label) for one, label in proposal.features.labels.items() if label in used]
     tables: list[tuple[str, dict[str, Any]]] = [
         ("[part]", {"name": part.name, "cad": part.cad_path.name}),
         *((f"[components.{_key(name)}]", {"role": "base"}) for name in names if name in bases),
@@ -84,13 +84,13 @@ class _Proposal:
         self._frames: set[tuple[object, ...]] = set()
         self._numbers = count(1)
         # The frame with most datums tells their order of precedence.
-        tolerances = sorted(pmi.tolerances, key=lambda one: -len(one.datums))
-        names = dict.fromkeys(datum[0] for one in tolerances for datum in one.datums)
-        self.datums = {name: self._datum(name) for name in names}
+        frames = sorted((one.datums for one in pmi.tolerances), key=len, reverse=True)
+        self.datums = {name: self._datum(name) for name in dict.fromkeys(datum[0] for one in frames for datum in one)}
 
     def rows(self, requirement: PmiRequirement) -> list[dict[str, Any]]:
         """Tables [[characteristics]] of a dimension or tolerance; none and a remark where it cannot be expressed."""
-        name = f"{requirement.name} ({requirement.kind} {requirement.value_mm or 0.0:g})"
+        state = ", free state" if "Free_State" in requirement.modifiers else ""
+        name = f"{requirement.name} ({requirement.kind} {requirement.value_mm or 0.0:g}{state})"
         try:
             return list(self._rows(requirement, name))
         except InputError as error:
@@ -110,13 +110,12 @@ class _Proposal:
         self._frames.add((kind, requirement.shapes, requirement.modifiers))
         if curved := len(requirement.shapes) - len(shapes):
             self.remarks.append(f"left out: {curved} curved faces of {name}: a profile is of flat faces in a part file")
-        low, high = requirement.limits_mm or (None, None)
         own = {
-            **({"min_mm": low, "max_mm": high} if kind in WITH_LIMITS else {"tolerance_mm": requirement.value_mm}),
+            **dict(zip(("min_mm", "max_mm"), requirement.limits_mm or (), strict=False)),
+            **({} if kind in WITH_LIMITS else {"tolerance_mm": requirement.value_mm}),
             **({"datums": frame} if frame else {}),
             **({"at_maximum_material": True} if "M" in requirement.modifiers else {}),
         }
-        state = ", free state" if "Free_State" in requirement.modifiers else ""
         # The profile of one flat face without datums is its flatness.
         kind = "flatness" if kind == "profile" and not frame else kind
         for group in [[*features, *others]] if kind in ("position", "distance") else [[one] for one in features]:
@@ -128,7 +127,7 @@ class _Proposal:
                 "kind": kind,
                 "of": of if of[1:] else of[0],
                 **own,
-                "source": f"PMI of {self.file}: {name}{state}",
+                "source": f"PMI of {self.file}: {name}",
             }
 
     def _problem(
@@ -145,8 +144,8 @@ class _Proposal:
         is_round = all(one.feature in ROUND for one in features)
         is_whole, is_located = kind == "profile" and not frame, kind not in (*WITH_LIMITS, "profile", "flatness")
         datums = [label.removesuffix(MAXIMUM_MARK) for label in frame]
-        sized = [one.label for one in features if "M" in requirement.modifiers]
-        sized += [label for label in datums if f"{label}{MAXIMUM_MARK}" in frame]
+        sized = [label for label in datums if f"{label}{MAXIMUM_MARK}" in frame]
+        sized += [one.label for one in features if "M" in requirement.modifiers]
         problems = {
             "it is linked to no face that such a characteristic can be about": not features,
             "it has no limits, or signs that are not clear": kind in WITH_LIMITS and low >= high,
@@ -200,8 +199,7 @@ class _Proposal:
             return f"it is {len(found)} features, as a pattern or the middle plane of faces, and a part file has one"
         if kinds - {"point"}:
             self.remarks.append(f"datum {name}: {'a plane' if is_plane else 'a point'} stands for each target area")
-        pairs = zip(targets or [name], found, strict=True)
-        return [self.features.labelled(feature, label) for label, feature in pairs]
+        return [self.features.labelled(*pair) for pair in zip(found, targets or [name], strict=True)]
 
 
 def _summary(pmi: Pmi, file: str, row_count: int) -> list[str]:
@@ -213,9 +211,9 @@ def _summary(pmi: Pmi, file: str, row_count: int) -> list[str]:
             f"{tolerances} geometric tolerances, {references} references to datums",
             f"{row_count} characteristics are proposed; check them against the drawing",
         ]
-    drawn = f"only drawn, {pmi.drawn_count or dimensions} annotations for people to read; export semantic PMI"
-    none = "none; export AP242 with semantic PMI, or write the part file by hand"
-    return [f"PMI of {file}: {drawn if pmi.drawn_count or dimensions else none}"]
+    if drawn_count := pmi.drawn_count or dimensions:
+        return [f"PMI of {file}: only drawn, {drawn_count} annotations for people to read; export semantic PMI (AP242)"]
+    return [f"PMI of {file}: none; export AP242 with semantic PMI, or write the part file by hand"]
 
 
 def _feature_row(feature: Datum) -> dict[str, Any]:

@@ -116,14 +116,13 @@ class Pmi:
     drawn_count: int
 
 
-def read_pmi(path: str | Path) -> Pmi:
+def read_pmi(path: Path) -> Pmi:
     """The PMI of a STEP file, which may be packed by gzip or zip; coordinates are in the root frame, mm.
 
     Raises:
         InputError: no STEP, a broken or truncated file, or one that takes too much time or memory.
         MissingDependencyError: without OCP.
     """
-    path = Path(path)
     require(f"{path}: PMI", "OCP")
     data = checked_text(unpacked(path), path)
     with tempfile.TemporaryDirectory(prefix="arview-pmi-") as name:
@@ -198,8 +197,9 @@ def _limits(values: Sequence[float], bounds: Sequence[tuple[float, float]]) -> t
         if one and other and abs(abs(one) * high - abs(other) * low) <= 1e-5 * abs(other) * low
     }
     is_below, is_all_below = next(iter(signs), (True, False))
-    limits = (round(value + (-low if is_below else low), 6), round(value + (-high if is_all_below else high), 6))
-    return None if len(signs) > 1 else limits
+    if len(signs) > 1:
+        return None
+    return round(value + (-low if is_below else low), 6), round(value + (-high if is_all_below else high), 6)
 
 
 def _shapes(contents: Sequence[Mapping[str, Any]]) -> tuple[PmiShape, ...]:

@@ -34,8 +34,6 @@ FACE, EDGE, VERTEX = TopAbs_ShapeEnum.TopAbs_FACE, TopAbs_ShapeEnum.TopAbs_EDGE,
 REVERSED = TopAbs_Orientation.TopAbs_REVERSED
 DRAWN = ("CommonLabel", "DimensionPresentation")
 """Kinds of dimensions that are annotations without a meaning."""
-Places = dict[Any, list[Any]]
-"""Each face and edge of the bodies, as often as it is placed."""
 
 
 def write_pmi(source: str, target: str) -> None:
@@ -62,10 +60,9 @@ def _content(main: Any) -> dict[str, Any]:
     roots = _labels(XCAFDoc_DocumentTool.ShapeTool_s(main).GetFreeShapes)
     dimensions, tolerances = _labels(tool.GetDimensionLabels), _labels(tool.GetGeomToleranceLabels)
     references = [(label, XCAFDoc_Datum.Set_s(label).GetObject()) for label in _labels(tool.GetDatumLabels)]
-    places: Places = {}
-    for kind in (FACE, EDGE):
-        for shape in _parts(map(XCAFDoc_ShapeTool.GetShape_s, roots), kind):
-            places.setdefault(shape.TShape(), []).append(shape)
+    places: dict[Any, list[Any]] = {}
+    for shape in (shape for kind in (FACE, EDGE) for shape in _parts(map(XCAFDoc_ShapeTool.GetShape_s, roots), kind)):
+        places.setdefault(shape.TShape(), []).append(shape)
     datums: dict[str, list[dict[str, Any]]] = {}
     for label, reference in references:
         for placed in _at_places(label, places, {"datums": [[_text(reference.GetName())]]}):
@@ -100,7 +97,7 @@ def _dimension(label: Any) -> dict[str, Any]:
         "values": [] if values is None else [values.Value(k) for k in range(values.Lower(), values.Upper() + 1)],
         "modifiers": [
             *map(_word, _items(found.GetModifiers())),
-            *(found.GetDescription(k).ToCString() for k in range(found.NbDescriptions())),
+            *(_text(found.GetDescription(k)) for k in range(found.NbDescriptions())),
             *(["class of tolerance"] if found.IsDimWithClassOfTolerance() else []),
         ],
     }
@@ -124,8 +121,14 @@ def _tolerance(label: Any) -> dict[str, Any]:
     }
 
 
-def _at_places(label: Any, places: Places, own: dict[str, Any]) -> list[dict[str, Any]]:
-    """A requirement with its shapes, once for each place of its part, from the second on with datums A_2, A_3, …"""
+def _at_places(label: Any, places: dict[Any, list[Any]], own: dict[str, Any]) -> list[dict[str, Any]]:
+    """A requirement with its shapes, once for each place of its part, from the second on with datums A_2, A_3, …
+
+    Args:
+        label: of the requirement.
+        places: each face and edge of the bodies, as often as it is placed.
+        own: what is the same at all places.
+    """
     sides = Sequence_TDF_Label(), Sequence_TDF_Label()
     XCAFDoc_DimTolTool.GetRefShapeLabel_s(label, *sides)
     shapes = [[XCAFDoc_ShapeTool.GetShape_s(one) for one in _items(side)] for side in sides]
@@ -152,13 +155,13 @@ def _described(shape: Any) -> dict[str, Any]:
         return own
     surface, properties = BRepAdaptor_Surface(TopoDS.Face(shape)), GProp_GProps()
     BRepGProp.SurfaceProperties_s(shape, properties)
-    own |= {"point_in_model": _numbers(properties.CentreOfMass()), "area_mm2": properties.Mass()}
-    own["kind"] = _word(surface.GetType()).lower()
-    if own["kind"] not in ("plane", "cylinder"):
+    kind = _word(surface.GetType()).lower()
+    own |= {"kind": kind, "point_in_model": _numbers(properties.CentreOfMass()), "area_mm2": properties.Mass()}
+    if kind not in ("plane", "cylinder"):
         return own
-    form = surface.Plane() if own["kind"] == "plane" else surface.Cylinder()
+    form = surface.Plane() if kind == "plane" else surface.Cylinder()
     axis, is_inward = form.Axis().Direction(), form.Position().Direct() == (shape.Orientation() == REVERSED)
-    if own["kind"] == "plane":
+    if kind == "plane":
         return own | {"direction_in_model": _numbers(axis.Reversed() if is_inward else axis, 9)}
     low, high = surface.FirstVParameter(), surface.LastVParameter()
     return own | {
