@@ -22,8 +22,6 @@ SAME_MM, SAME_SINE = 1e-3, 1e-4
 """Differences of place and direction below which faces lie on one plane or cylinder."""
 ACROSS_COSINE = 0.9
 """Cosine of the angle between a normal of a surface and that of the triangles that stand for it."""
-TARGETS = ("point", "circle", "rectangle", "area")
-"""Kinds of datum targets for which a point or plane stands."""
 MIN_TURN = 0.5
 """Share of its circumference that a round face has at least; less is the end of a slot, or a fillet."""
 
@@ -54,8 +52,8 @@ class PmiFeatures:
 
     def at(self, target: PmiShape, is_plane: bool) -> Datum:
         """The point feature of a datum target; of an area the plane on which it lies; raises InputError as `of`."""
-        if target.kind not in TARGETS:
-            raise InputError(f"its targets are of the kind {target.kind}; a part file has points")
+        if target.kind == "line":
+            raise InputError("its targets are lines, and a part file has points")
         point, direction = np.array(target.point_in_model), np.array(target.direction_in_model) if is_plane else None
         component, normal = self._surface(point, direction, target.length_mm if is_plane else ON_SURFACE_MM)
         return Datum("", "plane" if is_plane else "point", component, _vector(point), _vector(normal))
@@ -64,8 +62,8 @@ class PmiFeatures:
         """A feature with a given label, else with the one that it has, else with its kind and a number."""
         key = replace(feature, label="")
         taken = {*self.labels.values(), *(component.name for component in self.part.model.components)}
-        names = (f"{feature.feature}_{number}" for number in count(1))
-        self.labels[key] = label or self.labels.get(key) or next(name for name in names if name not in taken)
+        names = (name for number in count(1) if (name := f"{feature.feature}_{number}") not in taken)
+        self.labels[key] = label or self.labels.get(key) or next(names)
         return replace(key, label=self.labels[key])
 
     def _feature(self, group: list[PmiShape]) -> Datum:
@@ -85,8 +83,9 @@ class PmiFeatures:
         turn = areas.sum() / max(np.pi * first.diameter_mm * float(np.ptp(along)), 1e-9)
         if turn < MIN_TURN:
             raise InputError(f"a round face over {360 * turn:.0f}° only is no feature of a part file")
-        ends = [(point + along.min() * axis, -axis), (point + along.max() * axis, axis)]
-        ends.sort(key=lambda end: end[0]["xyz".index(self.part.up[-1])], reverse="-" not in self.part.up)
+        both = [(point + along.min() * axis, -axis), (point + along.max() * axis, axis)]
+        up = "xyz".index(self.part.up[-1])
+        ends = sorted(both, key=lambda end: float(end[0][up]), reverse="-" not in self.part.up)
         with_rim = [
             end
             for end in ends
@@ -101,7 +100,8 @@ class PmiFeatures:
     def _surface(self, point: Array, normal: Array | None, reach_mm: float = ON_SURFACE_MM) -> tuple[str, Array]:
         """Component and normal (3,) of the triangle nearest to a point, where a normal is given across that."""
         is_near = np.abs(np.einsum("ij,ij->i", self._normals, point - self._corners[:, 0])) <= ON_SURFACE_MM
-        is_near &= True if normal is None else self._normals @ normal > ACROSS_COSINE
+        if normal is not None:
+            is_near &= self._normals @ normal > ACROSS_COSINE
         near = self._corners[is_near]
         distances = np.linalg.norm(closest_point(near, np.tile(point, (len(near), 1))) - point, axis=1)
         if distances.min(initial=np.inf) > reach_mm:

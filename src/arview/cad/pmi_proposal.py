@@ -89,8 +89,8 @@ class _Proposal:
 
     def rows(self, requirement: PmiRequirement) -> list[dict[str, Any]]:
         """Tables [[characteristics]] of a dimension or tolerance; none and a remark where it cannot be expressed."""
-        state = ", free state" if "Free_State" in requirement.modifiers else ""
-        name = f"{requirement.name} ({requirement.kind} {requirement.value_mm or 0.0:g}{state})"
+        words = requirement.kind, f"{requirement.value_mm or 0.0:g}", *requirement.modifiers
+        name = f"{requirement.name} ({' '.join(words)})"
         try:
             return list(self._rows(requirement, name))
         except InputError as error:
@@ -139,7 +139,6 @@ class _Proposal:
         frame: Sequence[str],
     ) -> str:
         """Why a characteristic of a part file cannot express a requirement; empty where it can."""
-        low, high = requirement.limits_mm or (0.0, 0.0)
         flat_count = sum(one.feature == "plane" for one in features)
         is_round = all(one.feature in ROUND for one in features)
         is_whole, is_located = kind == "profile" and not frame, kind not in (*WITH_LIMITS, "profile", "flatness")
@@ -148,7 +147,10 @@ class _Proposal:
         sized += [one.label for one in features if "M" in requirement.modifiers]
         problems = {
             "it is linked to no face that such a characteristic can be about": not features,
-            "it has no limits, or signs that are not clear": kind in WITH_LIMITS and low >= high,
+            "it has no limits, or signs that are not clear": (
+                kind in WITH_LIMITS
+                and not (requirement.limits_mm and requirement.limits_mm[0] < requirement.limits_mm[1])
+            ),
             "a size is of round faces": kind == "size" and not is_round,
             f"it is between {len(features)} and {len(others)} features, and a distance is of two": (
                 kind == "distance" and [len(features), len(others)] != [1, 1]

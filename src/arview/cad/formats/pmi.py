@@ -11,7 +11,7 @@ import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from arview.cad.formats.archive import unpacked
 from arview.cad.formats.limited_process import ProcessLimits, run_limited
@@ -197,14 +197,14 @@ def _limits(values: Sequence[float], bounds: Sequence[tuple[float, float]]) -> t
         if one and other and abs(abs(one) * high - abs(other) * low) <= 1e-5 * abs(other) * low
     }
     is_below, is_all_below = next(iter(signs), (True, False))
-    if len(signs) > 1:
-        return None
-    return round(value + (-low if is_below else low), 6), round(value + (-high if is_all_below else high), 6)
+    smallest, largest = value + (-low if is_below else low), value + (-high if is_all_below else high)
+    return (round(smallest, 6), round(largest, 6)) if len(signs) < 2 else None
 
 
 def _shapes(contents: Sequence[Mapping[str, Any]]) -> tuple[PmiShape, ...]:
-    fields: list[dict[str, Any]] = [
-        {key: tuple(value) if isinstance(value, list) else value for key, value in content.items()}
-        for content in contents
-    ]
-    return tuple(PmiShape(**field) for field in fields)
+    return tuple(
+        PmiShape(
+            **cast(dict[str, Any], {key: tuple(one) if isinstance(one, list) else one for key, one in own.items()})
+        )
+        for own in contents
+    )

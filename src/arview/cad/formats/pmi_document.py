@@ -31,9 +31,6 @@ from OCP.XCAFDoc import (
 )
 
 FACE, EDGE, VERTEX = TopAbs_ShapeEnum.TopAbs_FACE, TopAbs_ShapeEnum.TopAbs_EDGE, TopAbs_ShapeEnum.TopAbs_VERTEX
-REVERSED = TopAbs_Orientation.TopAbs_REVERSED
-DRAWN = ("CommonLabel", "DimensionPresentation")
-"""Kinds of dimensions that are annotations without a meaning."""
 
 
 def write_pmi(source: str, target: str) -> None:
@@ -57,22 +54,23 @@ def write_pmi(source: str, target: str) -> None:
 
 def _content(main: Any) -> dict[str, Any]:
     tool = XCAFDoc_DocumentTool.DimTolTool_s(main)
-    roots = _labels(XCAFDoc_DocumentTool.ShapeTool_s(main).GetFreeShapes)
+    roots = [XCAFDoc_ShapeTool.GetShape_s(one) for one in _labels(XCAFDoc_DocumentTool.ShapeTool_s(main).GetFreeShapes)]
     dimensions, tolerances = _labels(tool.GetDimensionLabels), _labels(tool.GetGeomToleranceLabels)
     references = [(label, XCAFDoc_Datum.Set_s(label).GetObject()) for label in _labels(tool.GetDatumLabels)]
     places: dict[Any, list[Any]] = {}
-    for shape in (shape for kind in (FACE, EDGE) for shape in _parts(map(XCAFDoc_ShapeTool.GetShape_s, roots), kind)):
+    for shape in (*_parts(roots, FACE), *_parts(roots, EDGE)):
         places.setdefault(shape.TShape(), []).append(shape)
     datums: dict[str, list[dict[str, Any]]] = {}
     for label, reference in references:
         for placed in _at_places(label, places, {"datums": [[_text(reference.GetName())]]}):
             known = datums.setdefault(placed["datums"][0][0], [])
             known += [shape for shape in placed["shapes"] if shape not in known]
-    meant = [label for label in dimensions if _word(XCAFDoc_Dimension.Set_s(label).GetObject().GetType()) not in DRAWN]
+    found = [(label, _dimension(label)) for label in dimensions]
+    meant = [(label, one) for label, one in found if one["kind"] not in ("CommonLabel", "DimensionPresentation")]
     return {
         "counts": [len(dimensions), len(tolerances), len(references)],
         "drawn_dimensions": len(dimensions) - len(meant),
-        "dimensions": [one for label in meant for one in _at_places(label, places, _dimension(label))],
+        "dimensions": [one for label, own in meant for one in _at_places(label, places, own)],
         "tolerances": [one for label in tolerances for one in _at_places(label, places, _tolerance(label))],
         "datums": datums,
         "targets": {
@@ -96,7 +94,7 @@ def _dimension(label: Any) -> dict[str, Any]:
         "kind": _word(found.GetType()),
         "values": [] if values is None else [values.Value(k) for k in range(values.Lower(), values.Upper() + 1)],
         "modifiers": [
-            *map(_word, _items(found.GetModifiers())),
+            *map(_word, found.GetModifiers()),
             *(_text(found.GetDescription(k)) for k in range(found.NbDescriptions())),
             *(["class of tolerance"] if found.IsDimWithClassOfTolerance() else []),
         ],
@@ -105,7 +103,7 @@ def _dimension(label: Any) -> dict[str, Any]:
 
 def _tolerance(label: Any) -> dict[str, Any]:
     found = XCAFDoc_GeomTolerance.Set_s(label).GetObject()
-    rest = [found.GetMaterialRequirementModifier(), found.GetZoneModifier(), *_items(found.GetModifiers())]
+    rest = [found.GetMaterialRequirementModifier(), found.GetZoneModifier(), *found.GetModifiers()]
     labels = _labels(XCAFDoc_DimTolTool.GetDatumWithObjectOfTolerLabels_s, label)
     datums = sorted((XCAFDoc_Datum.Set_s(one).GetObject() for one in labels), key=lambda one: one.GetPosition())
     return {
@@ -115,8 +113,7 @@ def _tolerance(label: Any) -> dict[str, Any]:
         "zone": _word(found.GetTypeOfValue()),
         "modifiers": [word for word in map(_word, rest) if word != "None"],
         "datums": [
-            [_text(one.GetName()), one.GetPosition(), [_word(word) for word in _items(one.GetModifiers())]]
-            for one in datums
+            [_text(one.GetName()), one.GetPosition(), [_word(word) for word in one.GetModifiers()]] for one in datums
         ],
     }
 
@@ -131,7 +128,7 @@ def _at_places(label: Any, places: dict[Any, list[Any]], own: dict[str, Any]) ->
     """
     sides = Sequence_TDF_Label(), Sequence_TDF_Label()
     XCAFDoc_DimTolTool.GetRefShapeLabel_s(label, *sides)
-    shapes = [[XCAFDoc_ShapeTool.GetShape_s(one) for one in _items(side)] for side in sides]
+    shapes = [map(XCAFDoc_ShapeTool.GetShape_s, side) for side in sides]
     placed = [[places.get(shape.TShape(), [shape]) for shape in side] for side in shapes]
     counts = {len(found) for side in placed for found in side}
     return [
@@ -149,8 +146,8 @@ def _described(shape: Any) -> dict[str, Any]:
     if shape.ShapeType() == EDGE:
         curve = BRepAdaptor_Curve(TopoDS.Edge(shape))
         kind, middle = _word(curve.GetType()).lower(), 0.5 * (curve.FirstParameter() + curve.LastParameter())
-        own |= {"kind": f"{kind} edge", "point_in_model": _numbers(curve.Value(middle))}
-        return own | ({"direction_in_model": _numbers(curve.Line().Direction(), 9)} if kind == "line" else {})
+        direction = {"direction_in_model": _numbers(curve.Line().Direction(), 9)} if kind == "line" else {}
+        return own | {"kind": f"{kind} edge", "point_in_model": _numbers(curve.Value(middle)), **direction}
     if shape.ShapeType() != FACE:
         return own
     surface, properties = BRepAdaptor_Surface(TopoDS.Face(shape)), GProp_GProps()
@@ -160,16 +157,18 @@ def _described(shape: Any) -> dict[str, Any]:
     if kind not in ("plane", "cylinder"):
         return own
     form = surface.Plane() if kind == "plane" else surface.Cylinder()
-    axis, is_inward = form.Axis().Direction(), form.Position().Direct() == (shape.Orientation() == REVERSED)
+    axis, is_turned = form.Axis().Direction(), shape.Orientation() == TopAbs_Orientation.TopAbs_REVERSED
     if kind == "plane":
-        return own | {"direction_in_model": _numbers(axis.Reversed() if is_inward else axis, 9)}
-    low, high = surface.FirstVParameter(), surface.LastVParameter()
+        return own | {
+            "direction_in_model": _numbers(axis if form.Position().Direct() != is_turned else axis.Reversed(), 9)
+        }
+    to_middle = gp_Vec(axis).Multiplied(0.5 * (surface.FirstVParameter() + surface.LastVParameter()))
     return own | {
-        "point_in_model": _numbers(form.Location().Translated(gp_Vec(axis).Multiplied(0.5 * (low + high)))),
+        "point_in_model": _numbers(form.Location().Translated(to_middle)),
         "direction_in_model": _numbers(axis, 9),
         "diameter_mm": round(2.0 * form.Radius(), 6),
-        "length_mm": high - low,
-        "is_hole": is_inward,
+        "length_mm": surface.LastVParameter() - surface.FirstVParameter(),
+        "is_hole": form.Position().Direct() == is_turned,
     }
 
 
@@ -178,18 +177,14 @@ def _parts(shapes: Iterable[Any], kind: Any) -> list[Any]:
     found = IndexedMap_TopoDS_Shape_TopTools_ShapeMapHasher()
     for shape in shapes:
         TopExp.MapShapes_s(shape, kind, found)
-    return [found.FindKey(k) for k in range(1, found.Extent() + 1)]
+    return list(found)
 
 
 def _labels(fill: Callable[..., object], *arguments: Any) -> list[Any]:
     """The labels that a method of OpenCASCADE writes into its last argument."""
     sequence = Sequence_TDF_Label()
     fill(*arguments, sequence)
-    return _items(sequence)
-
-
-def _items(sequence: Any) -> list[Any]:
-    return [sequence.Value(k) for k in range(1, sequence.Length() + 1)]
+    return list(sequence)
 
 
 def _word(value: Any) -> str:
