@@ -6,13 +6,15 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 from itertools import chain, count
+from typing import cast
 
 import numpy as np
+from trimesh import unitize
 from trimesh.triangles import closest_point
 
 from arview.cad.datum_check import find_rims
 from arview.cad.formats.pmi import PmiShape
-from arview.cad.part import Datum, DatumFeature, Part
+from arview.cad.part import Datum, DatumFeature, Part, Vector
 from arview.errors import InputError
 from arview.geometry import Array
 
@@ -35,8 +37,7 @@ class PmiFeatures:
         self._rims = cache(lambda name: find_rims(part.model.component(name)))
         vertices, faces, self._ids = part.model.mesh
         self._corners = vertices[faces]
-        crossed = np.cross(self._corners[:, 1] - self._corners[:, 0], self._corners[:, 2] - self._corners[:, 0])
-        self._normals = crossed / np.maximum(np.linalg.norm(crossed, axis=1, keepdims=True), 1e-300)
+        self._normals = unitize(np.cross(*np.diff(self._corners, axis=1).transpose(1, 0, 2)))
 
     def of(self, shapes: Sequence[PmiShape]) -> list[Datum]:
         """The features that some shapes are: faces of one plane or cylinder are one.
@@ -54,7 +55,7 @@ class PmiFeatures:
         """The point feature of a datum target; of an area the plane on which it lies; raises InputError as `of`."""
         if target.kind == "line":
             raise InputError("its targets are lines, and a part file has points")
-        point, direction = np.array(target.point_in_model), np.array(target.direction_in_model) if is_plane else None
+        point, direction = np.array(target.point_in_model), np.array(target.direction_in_model) * is_plane
         component, normal = self._surface(point, direction, target.length_mm if is_plane else ON_SURFACE_MM)
         return Datum("", "plane" if is_plane else "point", component, _vector(point), _vector(normal))
 
@@ -74,18 +75,20 @@ class PmiFeatures:
         point, axis, corner = map(np.array, (first.point_in_model, first.direction_in_model, first.corner_in_model))
         radial = corner - point - ((corner - point) @ axis) * axis
         radial *= (-1.0 if first.is_hole else 1.0) / max(float(np.linalg.norm(radial)), 1e-9)
-        component, _ = self._surface(corner, {"plane": axis, "cylinder": radial}.get(kind))
+        component, _ = self._surface(corner, {"plane": axis, "cylinder": radial}.get(kind, np.zeros(3)))
         middles, areas = np.array([one.point_in_model for one in group]), np.array([one.area_mm2 for one in group])
+        middle = _vector(np.average(middles, axis=0, weights=np.maximum(areas, 1e-9)))
         if kind != "cylinder":
-            point = np.average(middles, axis=0, weights=np.maximum(areas, 1e-9))
-            return Datum("", "plane" if kind == "plane" else "edge", component, _vector(point), _vector(axis))
+            return Datum("", "plane" if kind == "plane" else "edge", component, middle, _vector(axis))
         along = (middles - point) @ axis + np.outer([-0.5, 0.5], [shape.length_mm for shape in group])
         turn = areas.sum() / max(np.pi * first.diameter_mm * float(np.ptp(along)), 1e-9)
         if turn < MIN_TURN:
             raise InputError(f"a round face over {360 * turn:.0f}° only is no feature of a part file")
-        both = [(point + along.min() * axis, -axis), (point + along.max() * axis, axis)]
-        up = "xyz".index(self.part.up[-1])
-        ends = sorted(both, key=lambda end: float(end[0][up]), reverse="-" not in self.part.up)
+        ends = sorted(
+            [(point + along.min() * axis, -axis), (point + along.max() * axis, axis)],
+            key=lambda end: float(end[0]["xyz".index(self.part.up[-1])]),
+            reverse="-" not in self.part.up,
+        )
         with_rim = [
             end
             for end in ends
@@ -97,11 +100,10 @@ class PmiFeatures:
         place, outward = [*with_rim, *ends][0]
         return Datum("", round_kind, component, _vector(place), _vector(outward), first.diameter_mm)
 
-    def _surface(self, point: Array, normal: Array | None, reach_mm: float = ON_SURFACE_MM) -> tuple[str, Array]:
-        """Component and normal (3,) of the triangle nearest to a point, where a normal is given across that."""
+    def _surface(self, point: Array, normal: Array, reach_mm: float = ON_SURFACE_MM) -> tuple[str, Array]:
+        """Component and normal (3,) of the triangle nearest to a point, across a normal that is not zero."""
         is_near = np.abs(np.einsum("ij,ij->i", self._normals, point - self._corners[:, 0])) <= ON_SURFACE_MM
-        if normal is not None:
-            is_near &= self._normals @ normal > ACROSS_COSINE
+        is_near &= self._normals @ normal >= ACROSS_COSINE * np.linalg.norm(normal)
         near = self._corners[is_near]
         distances = np.linalg.norm(closest_point(near, np.tile(point, (len(near), 1))) - point, axis=1)
         if distances.min(initial=np.inf) > reach_mm:
@@ -122,10 +124,12 @@ def _is_same(one: PmiShape, other: PmiShape) -> bool:
         and float(np.linalg.norm(offset - along * axis)) < SAME_MM
         and abs(along) < 0.5 * (one.length_mm + other.length_mm) + SAME_MM
     )
-    is_parallel = float(np.linalg.norm(np.cross(axis, other.direction_in_model))) < SAME_SINE
-    return one.kind == other.kind and is_parallel and (is_flat or is_round)
+    return (
+        one.kind == other.kind
+        and float(np.linalg.norm(np.cross(axis, other.direction_in_model))) < SAME_SINE
+        and (is_flat or is_round)
+    )
 
 
-def _vector(values: Array) -> tuple[float, float, float]:
-    x, y, z = (round(float(value), 6) + 0.0 for value in values)
-    return x, y, z
+def _vector(values: Array) -> Vector:
+    return cast(Vector, tuple(round(float(value), 6) + 0.0 for value in values))

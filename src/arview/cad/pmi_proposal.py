@@ -54,20 +54,20 @@ def propose_part(part: Part) -> str:
     rows = [row for requirement in (*pmi.dimensions, *pmi.tolerances) for row in proposal.rows(requirement)]
     datums = [one for found in proposal.datums.values() if not isinstance(found, str) for one in found]
     used = {name for row in rows for name in ([row["of"]] if isinstance(row["of"], str) else row["of"])}
-    bases = {*(one.component for one in datums), *(names if len(names) == 1 else [])}
-    used -= {one.label for one in datums}
     features = [replace(one, label=label) for one, label in proposal.features.labels.items() if label in used]
     tables: list[tuple[str, dict[str, Any]]] = [
         ("[part]", {"name": part.name, "cad": part.cad_path.name}),
-        *((f"[components.{_key(name)}]", {"role": "base"}) for name in names if name in bases),
+        *(
+            (f"[components.{_key(name)}]", {"role": "base"})
+            for name in names
+            if len(names) == 1 or name in {one.component for one in datums}
+        ),
         *((f"[datums.{_key(one.label)}]", _feature_row(one)) for one in datums),
-        *((f"[features.{_key(one.label)}]", _feature_row(one)) for one in features),
+        *((f"[features.{_key(one.label)}]", _feature_row(one)) for one in features if one not in datums),
         *(("[[characteristics]]", row) for row in rows),
     ]
     lines = [f"# {text}" for text in (*_summary(pmi, part.cad_path.name, len(rows)), *proposal.remarks)]
-    for head, row in tables:
-        lines += ["", head, *(f"{key} = {json.dumps(value, ensure_ascii=False)}" for key, value in row.items())]
-    return "\n".join([*lines, ""])
+    return "\n".join([*lines, *(_table(head, row) for head, row in tables), ""])
 
 
 class _Proposal:
@@ -89,12 +89,11 @@ class _Proposal:
 
     def rows(self, requirement: PmiRequirement) -> list[dict[str, Any]]:
         """Tables [[characteristics]] of a dimension or tolerance; none and a remark where it cannot be expressed."""
-        words = requirement.kind, f"{requirement.value_mm or 0.0:g}", *requirement.modifiers
-        name = f"{requirement.name} ({' '.join(words)})"
+        words = " ".join([requirement.kind, f"{requirement.value_mm or 0.0:g}", *requirement.modifiers])
         try:
-            return list(self._rows(requirement, name))
+            return list(self._rows(requirement, f"{requirement.name} ({words})"))
         except InputError as error:
-            self.remarks.append(f"left out: {name}: {error}")
+            self.remarks.append(f"left out: {requirement.name} ({words}): {error}")
             return []
 
     def _rows(self, requirement: PmiRequirement, name: str) -> Iterator[dict[str, Any]]:
@@ -143,8 +142,10 @@ class _Proposal:
         is_round = all(one.feature in ROUND for one in features)
         is_whole, is_located = kind == "profile" and not frame, kind not in (*WITH_LIMITS, "profile", "flatness")
         datums = [label.removesuffix(MAXIMUM_MARK) for label in frame]
-        sized = [label for label in datums if f"{label}{MAXIMUM_MARK}" in frame]
-        sized += [one.label for one in features if "M" in requirement.modifiers]
+        sized = [
+            *(label for label in datums if f"{label}{MAXIMUM_MARK}" in frame),
+            *(one.label for one in features if "M" in requirement.modifiers),
+        ]
         problems = {
             "it is linked to no face that such a characteristic can be about": not features,
             "it has no limits, or signs that are not clear": (
@@ -213,9 +214,14 @@ def _summary(pmi: Pmi, file: str, row_count: int) -> list[str]:
             f"{tolerances} geometric tolerances, {references} references to datums",
             f"{row_count} characteristics are proposed; check them against the drawing",
         ]
-    if drawn_count := pmi.drawn_count or dimensions:
-        return [f"PMI of {file}: only drawn, {drawn_count} annotations for people to read; export semantic PMI (AP242)"]
-    return [f"PMI of {file}: none; export AP242 with semantic PMI, or write the part file by hand"]
+    drawn = pmi.drawn_count or dimensions
+    lack = f"only drawn, {drawn} annotations for people to read" if drawn else "none"
+    return [f"PMI of {file}: {lack}; export AP242 with semantic PMI, or write the part file by hand"]
+
+
+def _table(head: str, row: dict[str, Any]) -> str:
+    """A table of TOML, of which JSON is a part for texts, numbers, truth and lists of them."""
+    return "\n".join(["", head, *(f"{key} = {json.dumps(value, ensure_ascii=False)}" for key, value in row.items())])
 
 
 def _feature_row(feature: Datum) -> dict[str, Any]:

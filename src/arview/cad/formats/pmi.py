@@ -10,6 +10,7 @@ import re
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 from typing import Any, cast
 
@@ -21,7 +22,6 @@ from arview.cad.part import Vector
 from arview.core.extras import require
 from arview.errors import InputError
 
-LIMITS = ProcessLimits(cpu_s=15.0, memory_mb=3000.0)
 _LINK = re.compile(
     rb"#(\d+)\s*=\s*(DATUM|SHAPE_ASPECT_RELATIONSHIP|GEOMETRIC_ITEM_SPECIFIC_USAGE|ITEM_IDENTIFIED_REPRESENTATION_USAGE)"
     rb"\s*\(((?:'[^']*'|[^;'])*)\)\s*;"
@@ -128,7 +128,9 @@ def read_pmi(path: Path) -> Pmi:
     with tempfile.TemporaryDirectory(prefix="arview-pmi-") as name:
         source, target = Path(name) / "source.step", Path(name) / "pmi.json"
         source.write_bytes(_with_faces_of_datums(data))
-        code, _ = run_limited(_READ, [str(source), str(target)], Path(name), len(data) / 1e6, LIMITS)
+        code, _ = run_limited(
+            _READ, [str(source), str(target)], Path(name), len(data) / 1e6, ProcessLimits(15.0, memory_mb=3000.0)
+        )
         if code or not target.is_file():
             raise InputError(f"{path}: OpenCASCADE cannot read its PMI (code {code}); is it whole? Export it again")
         content = json.loads(target.read_text(encoding="utf-8"))
@@ -152,18 +154,17 @@ def _with_faces_of_datums(data: bytes) -> bytes:
     """
     rows = [(number, kind, references(content)) for number, kind, content in _LINK.findall(data)]
     datums = {number for number, kind, _ in rows if kind == b"DATUM"}
-    related = [items for _, kind, items in rows if kind == b"SHAPE_ASPECT_RELATIONSHIP" and items[-1] in datums]
     contents = [
         b"('','',#%s,#%s,#%s);" % (feature, representation, face)
         for _, kind, (aspect, representation, *faces) in (
             row for row in rows if row[1].endswith(b"USAGE") and row[2][1:]
         )
-        for feature, datum in (items for items in related if len(items) == 2)
-        if aspect == datum or (aspect == feature and kind.startswith(b"ITEM"))
+        for feature, datum in (items for _, other, items in rows if other.endswith(b"RELATIONSHIP") and len(items) == 2)
+        if datum in datums and (aspect == datum or (aspect == feature and kind.startswith(b"ITEM")))
         for face in faces
     ]
-    first = 1 + max(map(int, re.findall(rb"#(\d+)\s*=", data)), default=0)
-    added = [b"#%d=GEOMETRIC_ITEM_SPECIFIC_USAGE%s\n" % (first + k, content) for k, content in enumerate(contents)]
+    numbers = count(1 + max(map(int, re.findall(rb"#(\d+)\s*=", data)), default=0))
+    added = [b"#%d=GEOMETRIC_ITEM_SPECIFIC_USAGE%s\n" % (next(numbers), content) for content in contents]
     return edited(data, {(data.rfind(b"ENDSEC"),) * 2: b"".join(added)})
 
 
@@ -188,17 +189,16 @@ def _limits(values: Sequence[float], bounds: Sequence[tuple[float, float]]) -> t
     OpenCASCADE keeps the magnitudes of bounds alone; their signs are those of the bounds of the file with the same
     ratio. None where these differ, and of a dimension without limits.
     """
-    if len(values) != 3:
-        return (values[0], values[1]) if len(values) == 2 else None
-    value, low, high = values
+    value, low, high = values if len(values) == 3 else (0.0, 0.0, 0.0)
     signs = {
         (one < 0, other < 0)
         for one, other in bounds
         if one and other and abs(abs(one) * high - abs(other) * low) <= 1e-5 * abs(other) * low
     }
     is_below, is_all_below = next(iter(signs), (True, False))
-    smallest, largest = value + (-low if is_below else low), value + (-high if is_all_below else high)
-    return (round(smallest, 6), round(largest, 6)) if len(signs) < 2 else None
+    if len(values) < 3 or len(signs) > 1:
+        return (values[0], values[1]) if len(values) == 2 else None
+    return round(value + (-low if is_below else low), 6), round(value + (-high if is_all_below else high), 6)
 
 
 def _shapes(contents: Sequence[Mapping[str, Any]]) -> tuple[PmiShape, ...]:

@@ -18,7 +18,8 @@ from OCP.OCP.collections import IndexedMap_TopoDS_Shape_TopTools_ShapeMapHasher,
 from OCP.STEPCAFControl import STEPCAFControl_Reader
 from OCP.TCollection import TCollection_ExtendedString
 from OCP.TDocStd import TDocStd_Document
-from OCP.TopAbs import TopAbs_Orientation, TopAbs_ShapeEnum
+from OCP.TopAbs import TopAbs_Orientation
+from OCP.TopAbs import TopAbs_ShapeEnum as Kind
 from OCP.TopExp import TopExp
 from OCP.TopoDS import TopoDS
 from OCP.XCAFDoc import (
@@ -29,8 +30,6 @@ from OCP.XCAFDoc import (
     XCAFDoc_GeomTolerance,
     XCAFDoc_ShapeTool,
 )
-
-FACE, EDGE, VERTEX = TopAbs_ShapeEnum.TopAbs_FACE, TopAbs_ShapeEnum.TopAbs_EDGE, TopAbs_ShapeEnum.TopAbs_VERTEX
 
 
 def write_pmi(source: str, target: str) -> None:
@@ -58,15 +57,18 @@ def _content(main: Any) -> dict[str, Any]:
     dimensions, tolerances = _labels(tool.GetDimensionLabels), _labels(tool.GetGeomToleranceLabels)
     references = [(label, XCAFDoc_Datum.Set_s(label).GetObject()) for label in _labels(tool.GetDatumLabels)]
     places: dict[Any, list[Any]] = {}
-    for shape in (*_parts(roots, FACE), *_parts(roots, EDGE)):
+    for shape in (*_parts(roots, Kind.TopAbs_FACE), *_parts(roots, Kind.TopAbs_EDGE)):
         places.setdefault(shape.TShape(), []).append(shape)
     datums: dict[str, list[dict[str, Any]]] = {}
     for label, reference in references:
         for placed in _at_places(label, places, {"datums": [[_text(reference.GetName())]]}):
             known = datums.setdefault(placed["datums"][0][0], [])
             known += [shape for shape in placed["shapes"] if shape not in known]
-    found = [(label, _dimension(label)) for label in dimensions]
-    meant = [(label, one) for label, one in found if one["kind"] not in ("CommonLabel", "DimensionPresentation")]
+    meant = [
+        (label, own)
+        for label in dimensions
+        if (own := _dimension(label))["kind"] not in ("CommonLabel", "DimensionPresentation")
+    ]
     return {
         "counts": [len(dimensions), len(tolerances), len(references)],
         "drawn_dimensions": len(dimensions) - len(meant),
@@ -128,8 +130,9 @@ def _at_places(label: Any, places: dict[Any, list[Any]], own: dict[str, Any]) ->
     """
     sides = Sequence_TDF_Label(), Sequence_TDF_Label()
     XCAFDoc_DimTolTool.GetRefShapeLabel_s(label, *sides)
-    shapes = [map(XCAFDoc_ShapeTool.GetShape_s, side) for side in sides]
-    placed = [[places.get(shape.TShape(), [shape]) for shape in side] for side in shapes]
+    placed = [
+        [places.get(shape.TShape(), [shape]) for shape in map(XCAFDoc_ShapeTool.GetShape_s, side)] for side in sides
+    ]
     counts = {len(found) for side in placed for found in side}
     return [
         own
@@ -141,14 +144,14 @@ def _at_places(label: Any, places: dict[Any, list[Any]], own: dict[str, Any]) ->
 
 def _described(shape: Any) -> dict[str, Any]:
     """A face or edge at its place, with the fields of `arview.cad.formats.pmi.PmiShape`."""
-    corner = next((_numbers(BRep_Tool.Pnt_s(TopoDS.Vertex(one))) for one in _parts([shape], VERTEX)), None)
+    corner = next((_numbers(BRep_Tool.Pnt_s(TopoDS.Vertex(one))) for one in _parts([shape], Kind.TopAbs_VERTEX)), None)
     own: dict[str, Any] = {"kind": "vertex", "point_in_model": corner, "corner_in_model": corner}
-    if shape.ShapeType() == EDGE:
+    if shape.ShapeType() == Kind.TopAbs_EDGE:
         curve = BRepAdaptor_Curve(TopoDS.Edge(shape))
         kind, middle = _word(curve.GetType()).lower(), 0.5 * (curve.FirstParameter() + curve.LastParameter())
         direction = {"direction_in_model": _numbers(curve.Line().Direction(), 9)} if kind == "line" else {}
         return own | {"kind": f"{kind} edge", "point_in_model": _numbers(curve.Value(middle)), **direction}
-    if shape.ShapeType() != FACE:
+    if shape.ShapeType() != Kind.TopAbs_FACE:
         return own
     surface, properties = BRepAdaptor_Surface(TopoDS.Face(shape)), GProp_GProps()
     BRepGProp.SurfaceProperties_s(shape, properties)
