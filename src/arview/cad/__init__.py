@@ -11,6 +11,8 @@ if TYPE_CHECKING:
     from arview.cad.check import check_part as check_part
     from arview.cad.datum_check import find_rims as find_rims
     from arview.cad.fitness import face_areas as face_areas
+    from arview.cad.formats.pmi import Pmi as Pmi
+    from arview.cad.formats.pmi import read_pmi as read_pmi
     from arview.cad.load import LoadedCad as LoadedCad
     from arview.cad.load import load_cad as load_cad
     from arview.cad.load import load_model as load_model
@@ -31,6 +33,7 @@ if TYPE_CHECKING:
     from arview.cad.part_file import part_from_text as part_from_text
     from arview.cad.picking import PickedFeature as PickedFeature
     from arview.cad.picking import pick_features as pick_features
+    from arview.cad.pmi_proposal import propose_part as propose_part
     from arview.cad.samples import Samples as Samples
     from arview.cad.samples import sample_surface as sample_surface
     from arview.cad.shape.mesh_topology import EdgeFaces as EdgeFaces
@@ -82,6 +85,8 @@ __getattr__, __dir__, __all__ = lazy_door(
             "load_part",
             "part_from_text",
         ),
+        "pmi_proposal": ("propose_part",),
+        "formats.pmi": ("Pmi", "read_pmi"),
         "picking": (
             "PickedFeature",
             "pick_features",

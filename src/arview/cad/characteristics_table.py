@@ -69,7 +69,7 @@ def _read(table: TomlTable, targets: Mapping[str, DatumFeature], datums: Mapping
             table.fail(
                 "datums", label, f"datums of the part, of {', '.join(datums)}; only round ones with {MAXIMUM_MARK}"
             )
-    is_at_maximum = table.flag("at_maximum_material") if kind == "position" else False
+    is_at_maximum = table.flag("at_maximum_material") if kind not in (*WITH_LIMITS, *FLAT_KINDS) else False
     tolerance_mm = table.positive("tolerance_mm", required=True) if kind not in WITH_LIMITS else None
     low, high = (table.number("min_mm"), table.number("max_mm")) if kind in WITH_LIMITS else (None, None)
     if kind in WITH_LIMITS and (

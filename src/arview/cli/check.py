@@ -22,7 +22,8 @@ def _show_example(ctx: click.Context, _parameter: click.Parameter, is_wanted: bo
 Examples:
   arview check part.toml
   arview check housing.stl --unit mm --camera fov:65
-  arview check left.step --against right.step""",
+  arview check left.step --against right.step
+  arview check bracket.step --pmi > part.toml""",
 )
 @click.argument("part")
 @UNIT
@@ -38,7 +39,8 @@ Examples:
     callback=_show_example,
     help="Print a part file with every key and what it means, and exit.",
 )
-def check(part: str, unit: str | None, camera_spec: str | None, others: tuple[str, ...]) -> None:
+@click.option("--pmi", is_flag=True, help="Print a part file with what the PMI of a STEP file (AP242) requires.")
+def check(part: str, unit: str | None, camera_spec: str | None, others: tuple[str, ...], pmi: bool) -> None:
     """Print what PART consists of, and what will be hard about finding and tracking it.
 
     Symmetric or ambiguous shapes, components too small to be seen from the declared distance, thin or open
@@ -47,6 +49,9 @@ def check(part: str, unit: str | None, camera_spec: str | None, others: tuple[st
     from arview.camera import load_camera
 
     loaded = cad.load_part(part, unit)
+    if pmi:
+        click.echo(cad.propose_part(loaded), nl=False)
+        return
     beside = [cad.load_part(other, unit) for other in others]
     camera = None
     if camera_spec is not None:

@@ -30,7 +30,7 @@ MODULES: dict[str, dict[str, str]] = {
     "quality": {"sqlalchemy": "SQLAlchemy"},
     "postgres": {"psycopg": "psycopg"},
     "batch": {"bokeh": "bokeh", "dask": "Dask", "distributed": "Dask", "fsspec": "fsspec", "tornado": "tornado"},
-    "formats": {"DracoPy": "DracoPy", "pillow_heif": "pillow-heif", "rawpy": "rawpy"},
+    "formats": {"DracoPy": "DracoPy", "OCP": "cadquery-ocp-novtk", "pillow_heif": "pillow-heif", "rawpy": "rawpy"},
     "gpu": {"kornia": "kornia", "torch": "torch"},
 }  # fmt: skip
 """For each extra of pyproject.toml the modules that it brings, and their names for people."""

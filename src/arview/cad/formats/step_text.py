@@ -37,8 +37,8 @@ def prepare_step(data: bytes, path: Path) -> tuple[bytes, list[str]]:
     Raises:
         InputError: not STEP, parentheses that never close, an assembly in itself, or too many components.
     """
-    others = OtherFiles(lambda file: _checked_text(unpacked(file), file))
-    data = others.added(_checked_text(data, path), path)
+    others = OtherFiles(lambda file: checked_text(unpacked(file), file))
+    data = others.added(checked_text(data, path), path)
     _check_instances(data, path)
     notes, products = list[str](), Products(data)
     if others.missing:
@@ -71,7 +71,7 @@ def step_unit_mm(data: bytes, path: Path) -> float:
     return float(next(value for value in units if value is not None))
 
 
-def _checked_text(data: bytes, path: Path) -> bytes:
+def checked_text(data: bytes, path: Path) -> bytes:
     """The content of a STEP file in UTF-8; raises InputError when it is no STEP, or not whole."""
     if b"ISO-10303-21" not in data[:4096]:
         raise InputError(f"{path}: not a STEP file (ISO-10303-21 is missing at its start)")
