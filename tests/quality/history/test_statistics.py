@@ -48,8 +48,8 @@ def test_subgroups_by_hand() -> None:
     assert (chart.lower, chart.upper) == pytest.approx((1.5 - 5.6418, 1.5 + 5.6418), abs=1e-4)
     assert chart.range_upper == pytest.approx(9.800, abs=1e-3)  # D4 = 3.2665
     assert control_chart([0.0, 2.0, 4.0, 0.0] * 4 + [9.0], size=2).values.tolist() == chart.values.tolist()
-    wide = control_chart([0.0, 1.0] * 20 + [-4.0, 5.0], size=2)
-    assert wide.signals[20] == "range beyond its limits"
+    wide = control_chart([0.0, 1.0] * 9 + [-4.0, 5.0], size=2)
+    assert wide.signals[9] == "range beyond its limits"
     with pytest.raises(InputError, match="need at least 8 subgroups of 4, there are 7"):
         control_chart(np.arange(31.0), size=4)
 

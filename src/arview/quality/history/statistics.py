@@ -225,8 +225,6 @@ def capability(
         InputError: there is no limit, there are fewer than 10 values or 8 subgroups, one is not finite, or all are
             equal.
     """
-    from scipy import stats
-
     if lower is None and upper is None:
         raise InputError("capability: there is no tolerance; give a limit with --lower or --upper")
     if lower is not None and upper is not None and lower >= upper:
@@ -248,22 +246,9 @@ def capability(
         pp, ppk = _indices(_three_sigma(middle, float(scores.std(ddof=1))), limits, len(x), len(x) - 1)
         if within.std > 1e-12:
             cp, cpk = _indices(_three_sigma(middle, within.std), limits, len(x), within.freedom)
-    warnings = []
-    if len(x) < ENOUGH_VALUES:
-        enough = ENOUGH_VALUES
-        warnings.append(f"only {len(x)} values: the indices are rough, see their intervals ({enough} are enough)")
-    if signals:
-        warnings.append(
-            f"the process is not in control ({len(signals)} of {len(x) // size} values are signals): Pp and Ppk"
-            " describe the past, Cp and Cpk do not predict the future"
-        )
-    if float(stats.shapiro(scores[:5000]).pvalue) < NORMALITY_LEVEL:
-        warnings.append(
-            f"the values do not follow the {distribution} distribution (Shapiro–Wilk, 1 %): the indices do not predict"
-            " reject rates"
-        )
     known = [value for value in stds or () if value is not None]
     share = min(1.0, float(np.mean(np.square(known))) / std**2) if known else None
+    warnings = _doubts(scores, distribution, len(signals), size)
     if share is not None and share > MAX_MEASUREMENT_SHARE:
         warnings.append(f"{share:.0%} of the variance is due to the measurement, not to the parts")
     return Capability(
@@ -281,6 +266,27 @@ def capability(
         warnings=tuple(warnings),
         distribution=distribution,
     )
+
+
+def _doubts(scores: Array, distribution: str, signals: int, size: int) -> list[str]:
+    """Doubts about indices that assume that the scores are normal and the process is in control."""
+    from scipy import stats
+
+    warnings = []
+    if len(scores) < ENOUGH_VALUES:
+        enough = ENOUGH_VALUES
+        warnings.append(f"only {len(scores)} values: the indices are rough, see their intervals ({enough} are enough)")
+    if signals:
+        warnings.append(
+            f"the process is not in control ({signals} of {len(scores) // size} values are signals): Pp and Ppk"
+            " describe the past, Cp and Cpk do not predict the future"
+        )
+    if float(stats.shapiro(scores[:5000]).pvalue) < NORMALITY_LEVEL:
+        warnings.append(
+            f"the values do not follow the {distribution} distribution (Shapiro–Wilk, 1 %): the indices do not predict"
+            " reject rates"
+        )
+    return warnings
 
 
 _Limits = tuple[float | None, float | None]

@@ -47,6 +47,7 @@ from arview.quality.history.tables import (
     guards,
     results,
     same,
+    stored_version,
     voids,
 )
 
@@ -282,16 +283,12 @@ class HistoryStore:
         """State that two CAD models are revisions of the same part, so that their series are joined.
 
         Args:
-            old, new: first digits of the hashes of the models.
-            reason: why their values can be compared.
-            by: who states it; default: `default_author`.
-
-        Returns:
-            The hashes of the models.
+            old, new: first digits of the hashes of the models, which are returned in full.
+            reason, by: why their values can be compared, and who states it, as for `void`.
 
         Raises:
-            InputError: no or more than one model of the store has such a hash, both are the same, they are joined
-                already, or the reason is empty.
+            InputError: not one model of the store has such a hash, both are the same, they are joined already, or the
+                reason is empty.
             OutputError: the store cannot be written to.
         """
         known = [str(row.model_hash) for row in self.rows(sa.select(results.c.model_hash).distinct())]
@@ -433,16 +430,6 @@ class HistoryStore:
     def _make_tables(self) -> None:
         """Create the tables of a new store, and in an older one those that it lacks."""
 
-        def stored_version(connection: sa.Connection) -> int:
-            if not sa.inspect(connection).has_table(about.name):
-                return 0
-            version = int(connection.scalar(sa.select(sa.func.max(about.c.version))) or 0)
-            if version > STORE_VERSION:
-                raise InputError(
-                    f"{self.name}: the store was written by a newer arview (version {version}); update arview"
-                )
-            return version
-
         def read_version() -> int:
             with self._begin(retries=True) as connection:
                 return stored_version(connection)
@@ -464,6 +451,8 @@ class HistoryStore:
                 connection.execute(sa.insert(about).values(version=STORE_VERSION))
 
         version = self._retried(read_version)
+        if version > STORE_VERSION:
+            raise InputError(f"{self.name}: the store was written by a newer arview (version {version}); update arview")
         if version < STORE_VERSION:
             if version:
                 self._tell(f"{self.name}: the store of an older arview is upgraded; its results stay as they are")

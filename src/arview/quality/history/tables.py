@@ -22,7 +22,9 @@ from sqlalchemy import (
     String,
     Table,
     Text,
+    func,
     inspect,
+    select,
 )
 
 from arview.inspection import MEASURANDS, CharacteristicResult
@@ -141,6 +143,13 @@ def guards(dialect: str) -> list[str]:
     return _sqlite_guards(names) if dialect == "sqlite" else _postgresql_guards(names)
 
 
+def stored_version(connection: Connection) -> int:
+    """The version of a store; 0 if it has no tables."""
+    if not inspect(connection).has_table(about.name):
+        return 0
+    return int(connection.scalar(select(func.max(about.c.version))) or 0)
+
+
 def add_missing(connection: Connection) -> None:
     """Add the tables, columns and indices that a store of an older version lacks."""
     metadata.create_all(connection)
@@ -200,7 +209,7 @@ def component_row(result_id: int, one: Any) -> dict[str, Any]:
 
 def characteristic_row(result_id: int, one: CharacteristicResult) -> dict[str, Any]:
     """The row of a characteristic of a result."""
-    lower, upper = one.limits_mm if one.zone_mm is None else (None, one.zone_mm - one.bonus_mm)
+    lower, upper = one.limits_mm if one.zone_mm is None else (None, round(one.zone_mm - one.bonus_mm, 9))
     return {
         "result_id": result_id, "name": one.name, "kind": one.kind, "value_mm": one.value_mm,
         "uncertainty_mm": one.uncertainty_mm, "lower_mm": lower, "upper_mm": upper, "bonus_mm": one.bonus_mm,
