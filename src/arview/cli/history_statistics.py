@@ -161,7 +161,7 @@ def _print_capability(
     if isinstance(ability, InputError):
         say(f"{lead}{ability}")
         return
-    of = {"normal": "", "Box–Cox": ", after a Box–Cox transform", "Yeo–Johnson": ", after a Yeo–Johnson transform"}
+    of = {"normal": "", "Box–Cox": ", by percentiles after a Box–Cox transform"}
     how = of.get(ability.distribution, f", by the percentiles of the {ability.distribution} distribution")
     for name, (value, low, high) in ability.named.items():
         click.echo(f"{lead}{name} {value:.2f} (95 %: {low:.2f} to {high:.2f}){how}")

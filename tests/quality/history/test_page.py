@@ -80,6 +80,7 @@ def test_the_page(where: Path) -> None:
         last = next(row for row in rows if row.startswith("<th>S09"))
         assert "2026-03-01 21:30" in last and "block_1" in last
         assert "S12" not in body  # void
+        assert [row.count("hole &amp; pin") for row in rows if row.startswith(("<th>S01", "<th>S02"))] == [1, 1]
         assert EVIL not in body and "&lt;script&gt;" in body
         assert status == 200 and headers["content-security-policy"].startswith("default-src 'none'")
         charts = ["/chart.svg?part=bench&amp;name=hole%20%26%20pin&amp;of=characteristic",

@@ -140,19 +140,19 @@ def test_coverage_of_the_intervals(count: int, size: int) -> None:
 
 
 def test_box_cox() -> None:
-    """Log-normal values: after the logarithm Ppk is (ln 20 - μ) / 3 σ with μ = 1, σ = 0.5, that is 1.3305."""
+    """Log-normal, μ = 1, σ = 0.5: median e, 99.865 % below e^2.5 = 12.182, Ppk (20 - e) / (12.182 - e) = 1.826."""
     x = np.random.default_rng(4).lognormal(1.0, 0.5, 400)
     ability = capability(x, None, 20.0)
     assert ability.distribution == "Box–Cox"
-    assert ability.ppk.low < 1.3305 < ability.ppk.high
+    assert ability.ppk.low < 1.826 < ability.ppk.high
     made, power = stats.boxcox(x)
-    limit = special.boxcox(20.0, power)
-    assert ability.ppk.value == pytest.approx((limit - made.mean()) / (3.0 * made.std(ddof=1)))
+    middle, end = special.inv_boxcox(made.mean() + np.array([0.0, 3.0]) * made.std(ddof=1), power)
+    assert ability.ppk.value == pytest.approx((20.0 - middle) / (end - middle))
     assert (20.0 - x.mean()) / (3.0 * x.std(ddof=1)) > 1.4 * ability.ppk.value  # what a normal distribution would claim
     assert ability.cpk is not None
-    signed = capability(x - 3.0, -3.5, 17.0)  # the same skew about zero
-    assert signed.distribution == "Yeo–Johnson"
-    assert signed.ppk.value < 1.6
+    outlier = capability([*np.random.default_rng(0).normal(0.1, 0.03, 60), 0.55], -0.5, 0.5)
+    assert outlier.distribution == "normal" and outlier.ppk.value < 2.1
+    assert any("do not follow the normal" in warning for warning in outlier.warnings)
     two_heaps = np.concatenate([np.full(50, 1.0), np.full(50, 2.0)]) + 0.001 * np.random.default_rng(0).normal(size=100)
     kept = capability(two_heaps, 0.0, 3.0)
     assert kept.distribution == "normal"

@@ -15,6 +15,7 @@ from arview.quality.history.statistics import Capability, ControlChart
 FORMATS = ("svg", "png", "pdf")
 MANY_VALUES = 2000
 """From so many values on they are drawn as pixels also in an SVG, which would take tens of megabytes."""
+_AT_END: dict[str, Any] = {"xycoords": ("axes fraction", "data")}
 _BLUE, _PALE, _RED = "#2b5c8a", "#9db4cb", "#c22f2b"
 
 
@@ -54,24 +55,30 @@ def _places(chart: ControlChart) -> Any:
 def _values(axes: Any, series: ComponentSeries, chart: ControlChart | None) -> None:
     x = np.array([one.value for one in series.values])
     numbers = np.arange(1, len(x) + 1)
-    is_pixels = {"rasterized": len(x) > MANY_VALUES}
+    is_many = len(x) > MANY_VALUES
     _tolerance(axes, series)
     stds = np.array([one.std or 0.0 for one in series.values])
-    if stds.any() and not is_pixels["rasterized"]:
+    if stds.any() and not is_many:
         axes.errorbar(numbers, x, yerr=2.0 * stds, fmt="none", ecolor="#c3ccd6", elinewidth=1.4, zorder=1)
     if chart is None or chart.size > 1:
-        axes.plot(numbers, x, ".", color=_PALE, markersize=3.5, zorder=2, **is_pixels)
+        axes.plot(numbers, x, "," if is_many else ".", color=_PALE, markersize=3.5, zorder=2, rasterized=is_many)
     if chart is not None:
         _line(axes, chart.center, f"mean {chart.center:.3f}")
         if chart.lower > 0.0 or not series.is_length:
             _line(axes, chart.lower, f"LCL {chart.lower:.3f}", is_dashed=True)
         _line(axes, chart.upper, f"UCL {chart.upper:.3f}", is_dashed=True)
         places, marked = _places(chart), list(chart.signals)
-        axes.plot(places, chart.values, color=_PALE, linewidth=0.9, zorder=2, **is_pixels)
+        if not is_many:
+            axes.plot(places, chart.values, color=_PALE, linewidth=0.9, zorder=2)
         calm = np.setdiff1d(np.arange(len(places)), marked)
-        axes.plot(places[calm], chart.values[calm], "o", color=_BLUE, markersize=4.5, zorder=3, **is_pixels)
-        axes.plot(places[marked], chart.values[marked], "D", color=_RED, markersize=6, zorder=4, **is_pixels)
-        for index in marked[:12]:
+        dots, diamonds = (",", ".") if is_many else ("o", "D")
+        axes.plot(places[calm], chart.values[calm], dots, color=_BLUE, markersize=4.5, zorder=3, rasterized=is_many)
+        axes.plot(
+            places[marked], chart.values[marked], diamonds, color=_RED, markersize=6, zorder=4, rasterized=is_many
+        )
+        # Of signals that are close together the first has its name.
+        gap = len(places) / 14.0
+        for index in [i for i, before in zip(marked, [-gap, *marked], strict=False) if i - before >= gap]:
             one = series.values[(index + 1) * chart.size - 1]
             at = (places[index], chart.values[index])
             _note(axes, one.serial or f"#{one.result_id}", at, _RED, xytext=(5, 6))
@@ -92,7 +99,8 @@ def _tolerance(axes: Any, series: ComponentSeries) -> None:
         elif np.isfinite(heights).any():
             axes.stairs(heights, places, baseline=None, color=INK, linewidth=1.1)
         if now is not None:
-            _label(axes, now, f"tolerance {now:+.3f}" if series.lower is not None else f"tolerance {now:.3f}", INK)
+            text = f"tolerance {now:+.3f}" if series.lower is not None else f"tolerance {now:.3f}"
+            _note(axes, text.replace("-", "−"), (1.0, now), INK, **_AT_END, xytext=(-2, 3), ha="right")
 
 
 def _ranges(axes: Any, series: ComponentSeries, chart: ControlChart | None) -> None:
@@ -105,7 +113,8 @@ def _ranges(axes: Any, series: ComponentSeries, chart: ControlChart | None) -> N
             "markersize": 3.5,
             "linewidth": 0.9,
         }
-        axes.plot(places, chart.ranges, "-o", rasterized=len(places) > MANY_VALUES, **style)
+        is_many = len(series.values) > MANY_VALUES
+        axes.plot(places, chart.ranges, "," if is_many else "-o", rasterized=is_many, **style)
         _line(axes, chart.range_center, f"mean {chart.range_center:.3f}")
         _line(axes, chart.range_upper, f"UCL {chart.range_upper:.3f}", is_dashed=True)
         if chart.range_lower > 0.0:
@@ -135,17 +144,12 @@ def _changes(above: Any, below: Any, series: ComponentSeries) -> None:
 def _line(axes: Any, y: float, text: str, is_dashed: bool = False) -> None:
     """Draw a horizontal line of the chart with its label."""
     axes.axhline(y, color=_BLUE, linewidth=0.9, linestyle=(0, (5, 3)) if is_dashed else "-")
-    _label(axes, y, text, _BLUE)
-
-
-def _label(axes: Any, y: float, text: str, color: str) -> None:
-    """Label a horizontal line at its right end."""
-    _note(axes, text, (1.0, y), color, xycoords=("axes fraction", "data"), xytext=(4, 0), va="center")
+    _note(axes, text.replace("-", "−"), (1.0, y), _BLUE, **_AT_END, xytext=(4, 0), va="center")
 
 
 def _note(axes: Any, text: str, at: tuple[float, float], color: str, **options: Any) -> None:
     # A serial or station is no formula, whatever dollar signs are in it.
-    text = text.replace("-", "−").replace("$", r"\$")
+    text = text.replace("$", r"\$")
     axes.annotate(text, at, textcoords="offset points", fontsize=8, color=color, annotation_clip=False, **options)
 
 

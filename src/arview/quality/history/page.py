@@ -24,7 +24,7 @@ from arview.web import font
 SHOWN_FAILURES = 20
 _TABLES = ((components, "distance"), (characteristics, "characteristic"))
 _HEADERS = {
-    "Content-Security-Policy": "default-src 'none'; style-src 'unsafe-inline'; font-src data:; img-src 'self';"
+    "Content-Security-Policy": "default-src 'none'; style-src 'unsafe-inline'; font-src data:; img-src 'self' data:;"
     " base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
     "X-Content-Type-Options": "nosniff",
     "Cache-Control": "no-store",
@@ -101,7 +101,10 @@ def _context(store: HistoryStore, part: str | None, zone: tzinfo | None) -> dict
     part = newest[0].part if newest else part or ""
     counted = (results.c.part == part, results.c.id.not_in(sa.select(voids.c.result_id)))
     verdicts = sa.select(results.c.verdict, sa.func.count().label("count")).where(*counted).group_by(results.c.verdict)
-    failures = store.listed(part, verdict="fail", limit=SHOWN_FAILURES)[::-1]
+    failing = sa.union(*(sa.select(table.c.result_id).where(table.c.verdict == "fail") for table, _ in _TABLES))
+    columns = results.c.id, results.c.serial, results.c.station, results.c.measured
+    last = sa.select(*columns).where(*counted, results.c.id.in_(failing)).order_by(results.c.measured.desc())
+    failures = store.rows(last.limit(SHOWN_FAILURES))
     failed: list[tuple[int, str]] = []
     names: dict[str, str] = {}
     of_results: dict[int, list[str]] = {}
@@ -136,7 +139,7 @@ def _context(store: HistoryStore, part: str | None, zone: tzinfo | None) -> dict
                 "id": one.id,
                 "serial": one.serial,
                 "station": one.station,
-                "time": time(one.measured),
+                "time": time(datetime.fromisoformat(one.measured)),
                 "names": ", ".join(of_results.get(one.id, ())),
             }
             for one in failures

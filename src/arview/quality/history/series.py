@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import namedtuple
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime, tzinfo
@@ -33,6 +34,13 @@ NOT_NEGATIVE = ("distance", "tilt")
 """Quantities that cannot be negative."""
 MAX_MARKS = 12
 """Changes of a kind that are stated and drawn singly; stations that take turns change with every part."""
+
+
+_Row = namedtuple(
+    "_Row",
+    "id serial station model_hash measured is_void is_there value std lower upper bonus finding stated has_zone",
+)
+"""A row of `_query`; reading the values of a row of SQLAlchemy takes ten times as long."""
 
 
 class SeriesValue(NamedTuple):
@@ -184,7 +192,7 @@ def series_of(
     if quantity not in get_args(Quantity):
         raise InputError(f"{quantity!r}: expected one of {', '.join(get_args(Quantity))}")
     part = part or _only_part(store)
-    every = store.rows(_query(part, name, quantity, station, since))
+    every = list(map(_Row._make, store.rows(_query(part, name, quantity, station, since))))
     found = [row for row in every if not row.is_void]
     if not found:
         raise InputError(f"{store.name}: no such results")
@@ -255,7 +263,7 @@ def _query(part: str, name: str, quantity: Quantity, station: str | None, since:
         sa.select(
             results.c.id, results.c.serial, results.c.station, results.c.model_hash, results.c.measured,
             voids.c.result_id.is_not(None).label("is_void"), table.c.name.is_not(None).label("is_there"),
-            *(column.label(label) for label, column in taken.items()),
+            *(taken[label].label(label) for label in _Row._fields[7:]),
         )
         .outerjoin(table, sa.and_(table.c.result_id == results.c.id, table.c.name == name))
         .outerjoin(voids, voids.c.result_id == results.c.id)
@@ -279,19 +287,13 @@ def _revisions_of(store: HistoryStore, model_hash: str) -> set[str]:
 
 def _values(rows: Sequence[Any]) -> list[SeriesValue]:
     """The values in rows of `_query` that have one, NaN where the component was missing."""
-    moment = datetime.fromisoformat
+    moment, make = datetime.fromisoformat, SeriesValue._make
     return [
-        SeriesValue(
-            result_id=row.id,
-            serial=row.serial,
-            station=row.station,
-            measured=moment(row.measured),
-            value=nan if row.finding else row.value,
-            std=row.std,
-            lower=row.lower,
-            upper=row.upper,
-            model_hash=row.model_hash,
-            bonus=row.bonus,
+        make(
+            (
+                *(row.id, row.serial, row.station, moment(row.measured), nan if row.finding else row.value),
+                *(row.std, row.lower, row.upper, row.model_hash, row.bonus),
+            )
         )
         for row in rows
         if row.value is not None or row.finding

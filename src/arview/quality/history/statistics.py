@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import NamedTuple
@@ -84,8 +84,8 @@ class Capability:
         cp, cpk: from the mean range, hence of the process without its drift; ``cp`` is None without both limits, and
             both are None for lengths near zero.
         pp, ppk: from all values; ``pp`` is None without both limits.
-        distribution: that the indices assume: normal, Box–Cox or Yeo–Johnson (normal after that transform), or one of
-            lengths, whose percentiles they are from.
+        distribution: that the indices assume: normal, Box–Cox (normal after that transform), or one of lengths; they
+            are from its percentiles.
         is_in_control: whether the process is in control; if not, Cp and Cpk do not predict it.
         measurement_share: share of the variance that is due to the measurement; None when unknown.
         warnings: doubts about the indices.
@@ -206,11 +206,10 @@ def capability(
     """Cp, Cpk, Pp and Ppk with 95 % confidence intervals.
 
     Pp and Ppk compare the limits with the mean and 3 sample standard deviations; Cp and Cpk take the standard deviation
-    from the mean range of the chart. Values that the Shapiro–Wilk test rejects as normal (1 %) are transformed first,
-    with their limits: by Box and Cox's power, or by Yeo and Johnson's where values or limits are not positive; unless
-    the test rejects the transformed values, too. Lengths
-    are bounded by zero: near it they have Ppk alone, from the median and the 0.135 % and 99.865 % percentiles (ISO
-    22514-2) of the distribution of the length of a normal vector (`_length_percentiles`). The interval of Cp follows
+    from the mean range of the chart. Positive values that the Shapiro–Wilk test rejects as normal (1 %) are compared by
+    the percentiles that normal ones have there (ISO 22514-2), after Box and Cox's power if the test accepts that.
+    Lengths are bounded by zero: near it they have Ppk alone, from the median and the 0.135 % and 99.865 % percentiles
+    of the distribution of the length of a normal vector (`_length_percentiles`). The interval of Cp follows
     from the chi-squared distribution of the variance, that of Cpk from Bissell's approximation (Applied Statistics 39,
     1990).
 
@@ -237,15 +236,16 @@ def capability(
     signals = control_chart(x, size=size).signals
     cp = cpk = None
     if is_length and mean < FAR_FROM_ZERO * std:
-        ends, scores, distribution = _length_percentiles(x, upper)
-        pp, ppk = _indices(ends, (lower, upper), len(x), len(x) - 1)
+        percentiles, scores, distribution = _length_percentiles(x, upper)
+        pp, ppk = _indices(np.array(percentiles), (lower, upper), len(x), len(x) - 1)
     else:
-        scores, limits, distribution = _normalised(x, (lower, upper))
+        scores, inverse, distribution = _normalised(x)
         within = control_chart(scores, size=size)
-        middle = float(scores.mean())
-        pp, ppk = _indices(_three_sigma(middle, float(scores.std(ddof=1))), limits, len(x), len(x) - 1)
+        reach = np.array([-3.0, 0.0, 3.0])
+        pp, ppk = _indices(inverse(scores.mean() + reach * scores.std(ddof=1)), (lower, upper), len(x), len(x) - 1)
         if within.std > 1e-12:
-            cp, cpk = _indices(_three_sigma(middle, within.std), limits, len(x), within.freedom)
+            ends = inverse(scores.mean() + reach * within.std)
+            cp, cpk = _indices(ends, (lower, upper), len(x), within.freedom)
     known = [value for value in stds or () if value is not None]
     share = min(1.0, float(np.mean(np.square(known))) / std**2) if known else None
     warnings = _doubts(scores, distribution, len(signals), size)
@@ -270,8 +270,6 @@ def capability(
 
 def _doubts(scores: Array, distribution: str, signals: int, size: int) -> list[str]:
     """Doubts about indices that assume that the scores are normal and the process is in control."""
-    from scipy import stats
-
     warnings = []
     if len(scores) < ENOUGH_VALUES:
         enough = ENOUGH_VALUES
@@ -281,7 +279,7 @@ def _doubts(scores: Array, distribution: str, signals: int, size: int) -> list[s
             f"the process is not in control ({signals} of {len(scores) // size} values are signals): Pp and Ppk"
             " describe the past, Cp and Cpk do not predict the future"
         )
-    if float(stats.shapiro(scores[:5000]).pvalue) < NORMALITY_LEVEL:
+    if not _is_normal(scores):
         warnings.append(
             f"the values do not follow the {distribution} distribution (Shapiro–Wilk, 1 %): the indices do not predict"
             " reject rates"
@@ -289,27 +287,20 @@ def _doubts(scores: Array, distribution: str, signals: int, size: int) -> list[s
     return warnings
 
 
-_Limits = tuple[float | None, float | None]
-
-
-def _three_sigma(mean: float, std: float) -> tuple[float, float, float]:
-    return mean - 3.0 * std, mean, mean + 3.0 * std
-
-
 def _indices(
-    ends: tuple[float, float, float], limits: _Limits, count: int, freedom: float
+    ends: Array, limits: tuple[float | None, float | None], count: int, freedom: float
 ) -> tuple[CapabilityIndex | None, CapabilityIndex]:
     """The index of the width of both limits, and that of the nearer limit.
 
     Args:
-        ends: percentiles 0.135, 50 and 99.865 %.
+        ends: (3,) percentiles 0.135, 50 and 99.865 %; the last one may be NaN: a power without that end.
         limits: lower and upper.
         count: number of values.
         freedom: degrees of freedom of the standard deviation.
     """
     from scipy import stats
 
-    (low_end, middle, high_end), (lower, upper) = ends, limits
+    (low_end, middle, high_end), (lower, upper) = np.nan_to_num(ends, nan=np.inf).tolist(), limits
     sides = [(upper - middle) / (high_end - middle)] if upper is not None else []
     sides += [(middle - lower) / (middle - low_end)] if lower is not None else []
     nearer = min(sides)
@@ -322,28 +313,24 @@ def _indices(
     return whole, CapabilityIndex(nearer, nearer - spread, nearer + spread)
 
 
-def _normalised(x: Array, limits: _Limits) -> tuple[Array, _Limits, str]:
-    """The values and limits, and "normal"; or if the values are not normal and a transform makes them so, both
-    transformed and its name.
+def _normalised(x: Array) -> tuple[Array, Callable[[Array], Array], str]:
+    """Normal scores of the values with their inverse: the values, or Box and Cox's power of those that are not normal.
+
+    The power is taken only if the scores are normal then.
     """
     from scipy import special, stats
 
-    def is_normal(of: Array) -> bool:
-        return float(stats.shapiro(of[:5000]).pvalue) >= NORMALITY_LEVEL
+    if x.min() > 0.0 and not _is_normal(x):
+        made, power = stats.boxcox(x)
+        if _is_normal(made):
+            return made, lambda scores: special.inv_boxcox(scores, power), "Box–Cox"
+    return x, np.asarray, "normal"
 
-    if is_normal(x):
-        return x, limits, "normal"
-    given = np.array([np.nan if limit is None else limit for limit in limits])
-    if min(x.min(), np.nanmin(given)) > 0.0:
-        name, (made, power) = "Box–Cox", stats.boxcox(x)
-        moved = special.boxcox(given, power)
-    else:
-        name, (made, power) = "Yeo–Johnson", stats.yeojohnson((x - x.mean()) / x.std())
-        moved = stats.yeojohnson((given - x.mean()) / x.std(), power)
-    if not (is_normal(made) and np.isfinite(moved[~np.isnan(given)]).all()):
-        return x, limits, "normal"
-    lower, upper = (None if np.isnan(limit) else float(limit) for limit in moved)
-    return made, (lower, upper), name
+
+def _is_normal(scores: Array) -> bool:
+    from scipy import stats
+
+    return float(stats.shapiro(scores[:5000]).pvalue) >= NORMALITY_LEVEL
 
 
 def capability_by_limits(

@@ -52,7 +52,7 @@ results = Table(
     Index("arview_results_by_part", "part", "measured"),
     Index("arview_results_by_serial", "serial"),
     # Holds all that a series takes from this table, whose rows are long by their documents.
-    Index("arview_results_of_series", "part", "measured", "id", "serial", "station", "model_hash"),
+    Index("arview_results_of_series", "part", "measured", "id", "serial", "station", "model_hash", "verdict"),
 )
 
 components = Table(
@@ -90,7 +90,7 @@ characteristics = Table(
 )
 for _table in (components, characteristics):
     _fails = _table.c.verdict == "fail"
-    Index(f"{_table.name}_failed", _table.c.name, sqlite_where=_fails, postgresql_where=_fails)
+    Index(f"{_table.name}_failed", _table.c.name, _table.c.result_id, sqlite_where=_fails, postgresql_where=_fails)
 
 same = Table(
     "arview_same",
