@@ -602,7 +602,7 @@ def test_a_store_of_an_older_version_is_upgraded_and_keeps_its_results(tmp_path:
         *(("arview_voids", "arview_decisions") if version == 1 else ()),
     ):
         outside.execute(f"DROP TABLE {name}")
-    for name in ("arview_results_of_series", "arview_components_failed"):
+    for name in ("arview_results_of_series", "arview_components_failed", "arview_components_of_series"):
         outside.execute(f"DROP INDEX {name}")
     for name in ("point", "axis"):
         outside.execute(f"ALTER TABLE arview_components DROP COLUMN {name}")

@@ -40,7 +40,7 @@ _Row = namedtuple(
     "_Row",
     "id serial station model_hash measured is_void is_there value std lower upper bonus finding stated has_zone",
 )
-"""A row of `_query`; reading the values of a row of SQLAlchemy takes ten times as long."""
+"""A result with its value; reading the values of a row of SQLAlchemy takes ten times as long."""
 
 
 class SeriesValue(NamedTuple):
@@ -192,7 +192,7 @@ def series_of(
     if quantity not in get_args(Quantity):
         raise InputError(f"{quantity!r}: expected one of {', '.join(get_args(Quantity))}")
     part = part or _only_part(store)
-    every = list(map(_Row._make, store.rows(_query(part, name, quantity, station, since))))
+    every = _rows(store, part, name, quantity, station, since)
     found = [row for row in every if not row.is_void]
     if not found:
         raise InputError(f"{store.name}: no such results")
@@ -202,7 +202,9 @@ def series_of(
     current = found if revisions else [row for row in found if row.model_hash in hashes]
     if len(current) < len(found):
         left_out.append(f"{len(found) - len(current)} measured against another CAD model than the newest")
-    kept = current if counted == "all" else _one_of_each_serial(current if counted == "first" else current[::-1])
+    kept = current
+    if counted != "all":
+        kept = _one_of_each_serial(current) if counted == "first" else _one_of_each_serial(current[::-1])[::-1]
     if not any(row.is_there for row in kept):
         raise InputError(f"{store.name}: {part!r} has no {what} {name!r}")
     earlier = len(current) - len(kept)
@@ -244,8 +246,29 @@ def _only_part(store: HistoryStore) -> str:
     return parts[0] if parts else ""
 
 
-def _query(part: str, name: str, quantity: Quantity, station: str | None, since: datetime | None) -> sa.Select[Any]:
-    """The results of a part in their order, each with the value of one component or characteristic if it has it."""
+def _rows(
+    store: HistoryStore, part: str, name: str, quantity: Quantity, station: str | None, since: datetime | None
+) -> list[_Row]:
+    """The results of a part in their order, each with the value of a component or characteristic if it has it.
+
+    Results and values are read apart, each along an index that holds them; a join would look up every value.
+    """
+    columns = results.c.id, results.c.serial, results.c.station, results.c.model_hash, results.c.measured
+    query = sa.select(*columns).where(results.c.part == part).order_by(results.c.measured, results.c.id)
+    if station is not None:
+        query = query.where(results.c.station == station)
+    if since is not None:
+        query = query.where(results.c.measured >= stamp(since))
+    voided = {row[0] for row in store.rows(sa.select(voids.c.result_id))}
+    found = {row[0]: tuple(row)[1:] for row in store.rows(_values_query(name, quantity))}
+    absent = (None,) * len(_Row._fields[7:])
+    return [
+        _Row._make((*row, row[0] in voided, row[0] in found, *found.get(row[0], absent))) for row in store.rows(query)
+    ]
+
+
+def _values_query(name: str, quantity: Quantity) -> sa.Select[Any]:
+    """Numbers of results, with the fields of `_Row` that a component or characteristic has in them."""
     is_angle = quantity in ("tilt", "twist")
     table = characteristics if quantity == "characteristic" else components
     taken: dict[str, Any] = {"std": sa.null() if is_angle else table.c.uncertainty_mm / 2.0}
@@ -259,20 +282,7 @@ def _query(part: str, name: str, quantity: Quantity, station: str | None, since:
         taken |= {"lower": -table.c.tolerance_mm if quantity in ("dx", "dy", "dz") else sa.null()}
         taken |= {"bonus": sa.literal(0.0), "has_zone": sa.literal(0)}
         taken |= {"stated": table.c.axis if is_angle else table.c.point}
-    query = (
-        sa.select(
-            results.c.id, results.c.serial, results.c.station, results.c.model_hash, results.c.measured,
-            voids.c.result_id.is_not(None).label("is_void"), table.c.name.is_not(None).label("is_there"),
-            *(taken[label].label(label) for label in _Row._fields[7:]),
-        )
-        .outerjoin(table, sa.and_(table.c.result_id == results.c.id, table.c.name == name))
-        .outerjoin(voids, voids.c.result_id == results.c.id)
-        .where(results.c.part == part)
-        .order_by(results.c.measured, results.c.id)
-    )  # fmt: skip
-    if station is not None:
-        query = query.where(results.c.station == station)
-    return query if since is None else query.where(results.c.measured >= stamp(since))
+    return sa.select(table.c.result_id, *(taken[label] for label in _Row._fields[7:])).where(table.c.name == name)
 
 
 def _revisions_of(store: HistoryStore, model_hash: str) -> set[str]:
@@ -285,8 +295,8 @@ def _revisions_of(store: HistoryStore, model_hash: str) -> set[str]:
     return found
 
 
-def _values(rows: Sequence[Any]) -> list[SeriesValue]:
-    """The values in rows of `_query` that have one, NaN where the component was missing."""
+def _values(rows: Sequence[_Row]) -> list[SeriesValue]:
+    """The values in rows that have one, NaN where the component was missing."""
     moment, make = datetime.fromisoformat, SeriesValue._make
     return [
         make(
@@ -324,9 +334,9 @@ def _of_newest_point(
     return kept, [f"{len(rows) - len(kept)} stated {what} ({'; '.join(others)}) than the newest ({newest})"]
 
 
-def _one_of_each_serial(rows: Sequence[Any]) -> list[Any]:
-    """The first row for each serial, and all without one, in the order of their measurement."""
-    found: dict[str, Any] = {}
+def _one_of_each_serial(rows: Sequence[_Row]) -> list[_Row]:
+    """The first row for each serial, and all without one, in their order."""
+    found: dict[str, _Row] = {}
     for row in rows:
         found.setdefault(row.serial or f"\0{row.id}", row)
-    return sorted(found.values(), key=lambda row: (row.measured, row.id))
+    return list(found.values())

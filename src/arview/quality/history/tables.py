@@ -72,7 +72,23 @@ components = Table(
     Column("finding", String(16)),
     Column("point", Text),  # that the displacement is stated for, in words; null: see the document
     Column("axis", Text),  # that the angles are about, likewise
-    Index("arview_components_by_name", "name"),
+    # Holds all that a series takes, so that the rows of one component lie together.
+    Index(
+        "arview_components_of_series",
+        "name",
+        "result_id",
+        "distance_mm",
+        "dx_mm",
+        "dy_mm",
+        "dz_mm",
+        "tolerance_mm",
+        "uncertainty_mm",
+        "tilt_deg",
+        "twist_deg",
+        "finding",
+        "point",
+        "axis",
+    ),
 )
 characteristics = Table(
     "arview_characteristics",
@@ -86,7 +102,17 @@ characteristics = Table(
     Column("upper_mm", Float(53)),  # without the bonus
     Column("bonus_mm", Float(53), nullable=False),
     Column("verdict", String(16), nullable=False),
-    Index("arview_characteristics_by_name", "name"),
+    Index(
+        "arview_characteristics_of_series",
+        "name",
+        "result_id",
+        "kind",
+        "value_mm",
+        "uncertainty_mm",
+        "lower_mm",
+        "upper_mm",
+        "bonus_mm",
+    ),
 )
 for _table in (components, characteristics):
     _fails = _table.c.verdict == "fail"
