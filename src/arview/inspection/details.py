@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, is_dataclass
 from functools import cache
 from types import UnionType
@@ -316,7 +316,7 @@ def to_json(value: Any) -> Any:
     return [to_json(item) for item in value] if isinstance(value, tuple) else value
 
 
-_type_hints = cache(get_type_hints)
+_type_hints: Callable[[Any], dict[str, Any]] = cache(get_type_hints)
 
 
 def from_json(kind: type[T], value: Any) -> T:

@@ -52,7 +52,7 @@ results = Table(
     Index("arview_results_by_part", "part", "measured"),
     Index("arview_results_by_serial", "serial"),
     # Holds all that a series takes from this table, whose rows are long by their documents.
-    Index("arview_results_of_series", "part", "measured", "id", "serial", "station", "model_hash", "verdict"),
+    Index("arview_results_of_series", *("part", "measured", "id", "serial", "station", "model_hash", "verdict")),
 )
 
 components = Table(
@@ -75,19 +75,21 @@ components = Table(
     # Holds all that a series takes, so that the rows of one component lie together.
     Index(
         "arview_components_of_series",
-        "name",
-        "result_id",
-        "distance_mm",
-        "dx_mm",
-        "dy_mm",
-        "dz_mm",
-        "tolerance_mm",
-        "uncertainty_mm",
-        "tilt_deg",
-        "twist_deg",
-        "finding",
-        "point",
-        "axis",
+        *(
+            "name",
+            "result_id",
+            "distance_mm",
+            "dx_mm",
+            "dy_mm",
+            "dz_mm",
+            "tolerance_mm",
+            "uncertainty_mm",
+            "tilt_deg",
+            "twist_deg",
+            "finding",
+            "point",
+            "axis",
+        ),
     ),
 )
 characteristics = Table(
@@ -104,14 +106,7 @@ characteristics = Table(
     Column("verdict", String(16), nullable=False),
     Index(
         "arview_characteristics_of_series",
-        "name",
-        "result_id",
-        "kind",
-        "value_mm",
-        "uncertainty_mm",
-        "lower_mm",
-        "upper_mm",
-        "bonus_mm",
+        *("name", "result_id", "kind", "value_mm", "uncertainty_mm", "lower_mm", "upper_mm", "bonus_mm"),
     ),
 )
 for _table in (components, characteristics):
