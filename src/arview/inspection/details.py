@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, is_dataclass
+from functools import cache
 from types import UnionType
 from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -315,9 +316,12 @@ def to_json(value: Any) -> Any:
     return [to_json(item) for item in value] if isinstance(value, tuple) else value
 
 
+_type_hints: Callable[[Any], dict[str, Any]] = cache(get_type_hints)
+
+
 def from_json(kind: type[T], value: Any) -> T:
     """The inverse of `to_json`, for a document that complies with the schema."""
-    hints = get_type_hints(kind)
+    hints = _type_hints(kind)
     return kind(**{name: _read(hints[name], item) for name, item in value.items()})
 
 

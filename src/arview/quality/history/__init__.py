@@ -10,6 +10,13 @@ if TYPE_CHECKING:
     from arview.quality.history.connection import default_store as default_store
     from arview.quality.history.export import to_csv as to_csv
     from arview.quality.history.export import to_json_lines as to_json_lines
+    from arview.quality.history.gauge import GaugeStudy as GaugeStudy
+    from arview.quality.history.gauge import crossed as crossed
+    from arview.quality.history.gauge import study_by_anova as study_by_anova
+    from arview.quality.history.gauge import study_by_ranges as study_by_ranges
+    from arview.quality.history.gauge import type_one as type_one
+    from arview.quality.history.gauge import vda5 as vda5
+    from arview.quality.history.page import application as application
     from arview.quality.history.series import ComponentSeries as ComponentSeries
     from arview.quality.history.series import SeriesValue as SeriesValue
     from arview.quality.history.series import limits_text as limits_text
@@ -35,6 +42,15 @@ __getattr__, __dir__, __all__ = lazy_door(
             "to_csv",
             "to_json_lines",
         ),
+        "gauge": (
+            "GaugeStudy",
+            "crossed",
+            "study_by_anova",
+            "study_by_ranges",
+            "type_one",
+            "vda5",
+        ),
+        "page": ("application",),
         "series": (
             "ComponentSeries",
             "SeriesValue",

@@ -5,18 +5,21 @@ from __future__ import annotations
 import getpass
 import os
 import socket
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import sqlalchemy as sa
 from sqlalchemy.exc import ArgumentError, DBAPIError, OperationalError, SQLAlchemyError
 
-from arview.errors import InputError
+from arview.errors import InputError, OutputError
 
 BUSY_S = 2.0
 """Time that a writer waits for others before it says so and tries again; a result is written in milliseconds."""
 READ_BUSY_S = 30.0
 """Time that a reader waits, which a writer hardly ever makes it do."""
+
+_NETWORK_FILE_SYSTEMS = ("nfs", "nfs4", "cifs", "smb3", "smbfs", "fuse.sshfs", "9p", "afs", "glusterfs", "ceph")
 
 _TEMPORARY = ("locked", "busy", "deadlock", "serialize", "could not connect", "server closed", "terminating connection")
 """Words of errors after which another attempt may succeed."""
@@ -72,6 +75,36 @@ def file_system(path: Path) -> str:
         if place.is_relative_to(folder) and len(folder.parts) >= best:
             best, kind = len(folder.parts), name
     return kind
+
+
+def check_file(path: Path, must_exist: bool, tell: Callable[[str], object]) -> None:
+    """Check that the file of a store is there or can be made, and that it is no place where SQLite is unsafe.
+
+    Raises:
+        InputError: the file or its folder does not exist, is a folder, or is on a network file system.
+        OutputError: the folder of the user's store cannot be made.
+    """
+    if not path.exists():
+        if must_exist:
+            raise InputError(f"{path}: no such store; `arview history add` creates it")
+        if not path.parent.is_dir():
+            if path != own_store():
+                raise InputError(
+                    f"{path.parent}: no such folder for a store; create it, or mount the share that it is on"
+                )
+            try:
+                path.parent.mkdir(parents=True, exist_ok=True)
+            except OSError as error:
+                raise OutputError(f"{path.parent}: cannot be created ({error.strerror or error})") from error
+        tell(f"{path}: a new store is made, there was none")
+    elif path.is_dir():
+        raise InputError(f"{path}: is a folder; expected the file of a store")
+    kind = file_system(path)
+    if kind in _NETWORK_FILE_SYSTEMS:
+        raise InputError(
+            f"{path}: is on a network file system ({kind}), on which SQLite is not safe with several writers;"
+            " use PostgreSQL (--store postgresql://…)"
+        )
 
 
 def default_store() -> str:

@@ -1,9 +1,11 @@
-"""Individuals and moving-range charts (ISO 7870-2), and capability with confidence intervals (ISO 22514-2)."""
+"""Control charts with Nelson's rules (ISO 7870-2), and capability with confidence intervals (ISO 22514-2)."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -12,20 +14,12 @@ from arview.errors import InputError
 from arview.geometry import Array
 from arview.quality.history.series import ComponentSeries
 
-_D2, _D4 = 1.128, 3.267
-"""Factors of moving ranges of two: mean range over standard deviation; upper limit over mean range (ISO 7870-2)."""
-
-
 MIN_CHART_VALUES = 8
-"""Values needed for control limits."""
+"""Values, or subgroups, needed for control limits."""
 MIN_CAPABILITY_VALUES = 10
 """Values needed for capability indices."""
 ENOUGH_VALUES = 50
 """With fewer values the indices come with a warning."""
-SAME_SIDE_RUN = 8
-"""Consecutive values on one side of the mean that are a signal."""
-TREND_RUN = 6
-"""Consecutive rising or falling values that are a signal."""
 NORMALITY_LEVEL = 0.01
 """Significance level of the Shapiro-Wilk test."""
 RIVAL_AIC = 2.0
@@ -34,18 +28,23 @@ FAR_FROM_ZERO = 10.0
 """Mean over standard deviation above which lengths are distributed as if they had no bound at zero."""
 MAX_MEASUREMENT_SHARE = 0.3
 """Share of the variance due to the measurement above which there is a warning."""
+_MOVING_RANGE_FREEDOM = 0.605
+"""Degrees of freedom of a standard deviation from moving ranges, for each range: they overlap, which costs a third."""
 
 
 @dataclass(frozen=True)
 class ControlChart:
-    """Control limits of the values and of their moving ranges, and the signals.
+    """Control limits of the values or of the means of subgroups, and of their ranges, and the signals.
 
     Attributes:
-        values: (N,) values.
-        center, lower, upper: mean of the values, and limits at ± 3 standard deviations from the mean moving range.
-        ranges: (N-1,) absolute differences of consecutive values.
-        range_center, range_upper: mean and upper limit of the ranges.
+        values: (N,) values, or means of subgroups.
+        center, lower, upper: mean of the values, and limits at ± 3 of their standard deviations.
+        ranges: (N-1,) absolute differences of consecutive values, or (N,) ranges of the subgroups.
+        range_center, range_lower, range_upper: mean of the ranges and its limits.
+        std: standard deviation of a single value, from the mean range: within the process, without its drift.
+        freedom: degrees of freedom of ``std``.
         signals: reasons by index of the value; empty when the process is in control.
+        size: values in a subgroup; 1: individual values with moving ranges.
     """
 
     values: Array
@@ -54,8 +53,12 @@ class ControlChart:
     upper: float
     ranges: Array
     range_center: float
+    range_lower: float
     range_upper: float
+    std: float
+    freedom: float
     signals: dict[int, str]
+    size: int = 1
 
     @property
     def is_in_control(self) -> bool:
@@ -63,17 +66,27 @@ class ControlChart:
         return not self.signals
 
 
+class CapabilityIndex(NamedTuple):
+    """An index with its two-sided 95 % confidence interval."""
+
+    value: float
+    low: float
+    high: float
+
+
 @dataclass(frozen=True)
 class Capability:
-    """Capability indices, or performance indices when the process is not in control (ISO 22514-2).
+    """Capability indices, from the standard deviation within the process, and performance indices, from that of all.
 
     Attributes:
         count, mean, std: number, mean and sample standard deviation of the values.
         lower, upper: tolerance limits; one of them may be None.
-        cp, cp_interval: Cp and its two-sided 95 % confidence interval; None without both limits.
-        cpk, cpk_interval: Cpk, with the nearer limit, and its two-sided 95 % confidence interval.
-        distribution: whose percentiles the indices are from.
-        is_in_control: whether the process is in control; if not, the indices are Pp and Ppk.
+        cp, cpk: from the mean range, hence of the process without its drift; ``cp`` is None without both limits, and
+            both are None for lengths near zero.
+        pp, ppk: from all values; ``pp`` is None without both limits.
+        distribution: that the indices assume: normal, Box–Cox (normal after that transform), or one of lengths; they
+            are from its percentiles.
+        is_in_control: whether the process is in control; if not, Cp and Cpk do not predict it.
         measurement_share: share of the variance that is due to the measurement; None when unknown.
         warnings: doubts about the indices.
     """
@@ -83,58 +96,103 @@ class Capability:
     std: float
     lower: float | None
     upper: float | None
-    cp: float | None
-    cp_interval: tuple[float, float] | None
-    cpk: float
-    cpk_interval: tuple[float, float]
+    cp: CapabilityIndex | None
+    cpk: CapabilityIndex | None
+    pp: CapabilityIndex | None
+    ppk: CapabilityIndex
     is_in_control: bool
     measurement_share: float | None
     warnings: tuple[str, ...]
     distribution: str = "normal"
 
     @property
-    def names(self) -> tuple[str, str]:
-        """Names of the indices."""
-        return ("Cp", "Cpk") if self.is_in_control else ("Pp", "Ppk")
+    def named(self) -> dict[str, CapabilityIndex]:
+        """The indices that there are, by their names."""
+        every = {"Cp": self.cp, "Cpk": self.cpk, "Pp": self.pp, "Ppk": self.ppk}
+        return {name: index for name, index in every.items() if index is not None}
 
 
-def control_chart(values: ArrayLike, is_length: bool = False) -> ControlChart:
-    """Control limits from the mean moving range, which, unlike the standard deviation, is insensitive to drift.
+@cache
+def range_factors(size: int) -> tuple[float, float]:
+    """Mean and standard deviation of the range of ``size`` standard normal values (d2 and d3), to 1e-5."""
+    from scipy import integrate, stats
 
-    Signals are a value beyond 3 standard deviations, 8 consecutive values on one side of the mean, and 6 consecutive
-    rising or falling values (ISO 7870-2; Nelson, J. Quality Technology 16, 1984). A range beyond its limit is no
-    signal: consecutive ranges share a value and are not normally distributed, so such ranges are frequent by chance.
+    heights = np.linspace(0.0, 12.0, 601)
+    beyond = stats.studentized_range(size, np.inf).sf(heights)
+    mean = float(integrate.simpson(beyond, x=heights))
+    square = float(integrate.simpson(2.0 * heights * beyond, x=heights))
+    return mean, float(np.sqrt(square - mean**2))
+
+
+def control_chart(values: ArrayLike, is_length: bool = False, size: int = 1) -> ControlChart:
+    """Control limits from the mean range, which, unlike the standard deviation, is insensitive to drift.
+
+    Individual values with their moving ranges, or X̄ and R of consecutive subgroups; an incomplete last subgroup is
+    left out. d2 has three decimals, as in the tables of ISO 7870-2. The signals are those of Nelson's eight rules (J.
+    Quality Technology 16, 1984), and in subgroups also a range beyond its limits. A moving range beyond its limit is no
+    signal: consecutive ones share a value and are not normally distributed, so that such ranges are frequent by chance.
 
     Args:
         values: (N,) values in their order.
         is_length: whether the values, and thus the lower limit, cannot be negative.
+        size: values in a subgroup, 1 to 25.
 
     Raises:
-        InputError: there are fewer than 8 values, or one is not finite.
+        InputError: there are fewer than 8 values or subgroups, or one is not finite.
     """
-    x = _checked(values, MIN_CHART_VALUES, "control limits")
-    ranges = np.abs(np.diff(x))
-    center, mean_range = float(x.mean()), float(ranges.mean())
-    reach = 3.0 * mean_range / _D2
-    signals: dict[int, str] = {}
-    for index in np.flatnonzero(np.abs(x - center) > reach):
-        signals[int(index)] = "beyond the control limits"
-    run = SAME_SIDE_RUN
-    _add_runs(signals, np.sign(x - center), run, f"{run} in a row on one side of the mean")
-    # Six points in a row that rise are five steps of one sign.
-    steps = np.concatenate([[0.0], np.sign(np.diff(x))])
-    _add_runs(signals, steps, TREND_RUN - 1, f"{TREND_RUN} in a row that rise or fall")
-    lower = max(0.0, center - reach) if is_length else center - reach
+    x = np.asarray(values, dtype=np.float64).ravel()
+    points = x if size == 1 else x[: len(x) // size * size].reshape(-1, size).mean(axis=1)
+    _check(points, MIN_CHART_VALUES, "control limits", "values" if size == 1 else f"subgroups of {size}")
+    ranges = np.abs(np.diff(x)) if size == 1 else np.ptp(x[: len(points) * size].reshape(-1, size), axis=1)
+    d2, d3 = range_factors(max(size, 2))
+    center, mean_range = float(points.mean()), float(ranges.mean())
+    std = mean_range / round(d2, 3)
+    reach, spread = 3.0 * std / np.sqrt(size), 3.0 * d3 / d2 * mean_range
+    signals = _nelson((points - center) / reach * 3.0) if reach > 1e-12 else {}
+    if size > 1:
+        beyond = np.flatnonzero(np.abs(ranges - mean_range) > spread)
+        signals = dict.fromkeys(beyond.tolist(), "range beyond its limits") | signals
     return ControlChart(
-        x,
-        center,
-        lower,
-        upper=center + reach,
+        values=points,
+        center=center,
+        lower=float(max(0.0, center - reach) if is_length else center - reach),
+        upper=float(center + reach),
         ranges=ranges,
         range_center=mean_range,
-        range_upper=_D4 * mean_range,
+        range_lower=max(0.0, mean_range - spread),
+        range_upper=mean_range + spread,
+        std=std,
+        freedom=len(ranges) * (_MOVING_RANGE_FREEDOM if size == 1 else d2**2 / (2.0 * d3**2)),
         signals=dict(sorted(signals.items())),
+        size=size,
     )
+
+
+def _nelson(z: Array) -> dict[int, str]:
+    """The values at which one of Nelson's rules is broken, each with the first such rule.
+
+    Args:
+        z: (N,) differences from the mean in standard deviations.
+    """
+    steps = np.sign(np.diff(z, prepend=z[:1]))
+    swings = steps * np.concatenate([[0.0], steps[:-1]]) < 0.0
+    signals: dict[int, str] = {}
+    # Six values that rise are five steps; fourteen values that alternate have twelve changes of direction.
+    for masks, window, needed, rule in (
+        ((np.abs(z) > 3.0,), 1, 1, "beyond the control limits (rule 1)"),
+        ((z > 0.0, z < 0.0), 9, 9, "9 in a row on one side of the mean (rule 2)"),
+        ((steps > 0.0, steps < 0.0), 5, 5, "6 in a row that rise or fall (rule 3)"),
+        ((swings,), 12, 12, "14 in a row that alternate up and down (rule 4)"),
+        ((z > 2.0, z < -2.0), 3, 2, "2 of 3 beyond 2 standard deviations on one side (rule 5)"),
+        ((z > 1.0, z < -1.0), 5, 4, "4 of 5 beyond 1 standard deviation on one side (rule 6)"),
+        ((np.abs(z) < 1.0,), 15, 15, "15 in a row within 1 standard deviation (rule 7)"),
+        ((np.abs(z) > 1.0,), 8, 8, "8 in a row beyond 1 standard deviation on either side (rule 8)"),
+    ):
+        for mask in masks:
+            counts = np.convolve(mask, np.ones(window, dtype=int))[: len(z)]
+            for index in np.flatnonzero(mask & (counts >= needed)).tolist():
+                signals.setdefault(index, rule)
+    return signals
 
 
 def capability(
@@ -143,97 +201,156 @@ def capability(
     upper: float | None,
     stds: Sequence[float | None] | None = None,
     is_length: bool = False,
+    size: int = 1,
 ) -> Capability:
-    """Cp and Cpk by percentiles (ISO 22514-2), with 95 % confidence intervals.
+    """Cp, Cpk, Pp and Ppk with 95 % confidence intervals.
 
-    The limits are compared with the median and with the percentiles 0.135 % and 99.865 %, which for normal values are 3
-    sample standard deviations from the mean. Lengths are bounded by zero: theirs are of the distribution of the length
-    of a normal vector (`_length_percentiles`). The interval of Cp follows from the chi-squared distribution of the
-    variance (exact for normal values), that of Cpk from Bissell's approximation (Applied Statistics 39, 1990).
+    Pp and Ppk compare the limits with the mean and 3 sample standard deviations; Cp and Cpk take the standard deviation
+    from the mean range of the chart. Positive values that the Shapiro–Wilk test rejects as normal (1 %) are compared by
+    the percentiles that normal ones have there (ISO 22514-2), after Box and Cox's power if the test accepts that.
+    Lengths are bounded by zero: near it they have Ppk alone, from the median and the 0.135 % and 99.865 % percentiles
+    of the distribution of the length of a normal vector (`_length_percentiles`). The interval of Cp follows
+    from the chi-squared distribution of the variance, that of Cpk from Bissell's approximation (Applied Statistics 39,
+    1990).
 
     Args:
-        values: (N,) values.
+        values: (N,) values in their order.
         lower, upper: tolerance limits, of which at least one is needed.
         stds: standard uncertainties of the measurements, as far as they are known.
         is_length: whether the values cannot be negative.
+        size: values in a subgroup of the chart.
 
     Raises:
-        InputError: there is no limit, there are fewer than 10 values, one is not finite, or all are equal.
+        InputError: there is no limit, there are fewer than 10 values or 8 subgroups, one is not finite, or all are
+            equal.
     """
-    from scipy import stats
-
     if lower is None and upper is None:
         raise InputError("capability: there is no tolerance; give a limit with --lower or --upper")
     if lower is not None and upper is not None and lower >= upper:
         raise InputError(f"capability: the lower limit {lower:g} is not less than the upper one {upper:g}")
-    x = _checked(values, MIN_CAPABILITY_VALUES, "Cp and Cpk")
-    count, mean, std = len(x), float(x.mean()), float(x.std(ddof=1))
+    x = np.asarray(values, dtype=np.float64).ravel()
+    _check(x, MIN_CAPABILITY_VALUES, "Cp and Cpk")
+    mean, std = float(x.mean()), float(x.std(ddof=1))
     if std < 1e-12:
-        raise InputError(f"capability: all {count} values are equal")
-    free = count - 1
-    (low_end, middle, high_end), scores, distribution = (mean - 3.0 * std, mean, mean + 3.0 * std), x, "normal"
+        raise InputError(f"capability: all {len(x)} values are equal")
+    signals = control_chart(x, size=size).signals
+    cp = cpk = None
     if is_length and mean < FAR_FROM_ZERO * std:
-        (low_end, middle, high_end), scores, distribution = _length_percentiles(x, upper)
-    cp = cp_interval = None
-    if lower is not None and upper is not None:
-        cp = (upper - lower) / (high_end - low_end)
-        low, high = np.sqrt(stats.chi2.ppf([0.025, 0.975], free) / free)
-        cp_interval = (float(cp * low), float(cp * high))
-    sides = [(upper - middle) / (high_end - middle)] if upper is not None else []
-    sides += [(middle - lower) / (middle - low_end)] if lower is not None else []
-    cpk = min(sides)
-    spread = float(stats.norm.ppf(0.975)) * float(np.sqrt(1.0 / (9.0 * count) + cpk**2 / (2.0 * free)))
-    warnings = []
-    if count < ENOUGH_VALUES:
-        enough = ENOUGH_VALUES
-        warnings.append(f"only {count} values: the indices are rough, see their intervals ({enough} are enough)")
-    chart = control_chart(x)
-    if not chart.is_in_control:
-        warnings.append("the process is not in control: Pp and Ppk describe the past, not the future")
-    if float(stats.shapiro(scores[:5000]).pvalue) < NORMALITY_LEVEL:
-        warnings.append(
-            f"the values do not follow the {distribution} distribution (Shapiro–Wilk, 1 %): the indices do not predict"
-            " reject rates"
-        )
-    known = [one for one in stds or () if one is not None]
-    share = None
-    if known:
-        share = min(1.0, float(np.mean(np.square(known))) / std**2)
-        if share > MAX_MEASUREMENT_SHARE:
-            warnings.append(f"{share:.0%} of the variance is due to the measurement, not to the parts")
+        percentiles, scores, distribution = _length_percentiles(x, upper)
+        pp, ppk = _indices(np.array(percentiles), (lower, upper), len(x), len(x) - 1)
+    else:
+        scores, inverse, distribution = _normalised(x)
+        within = control_chart(scores, size=size)
+        reach = np.array([-3.0, 0.0, 3.0])
+        pp, ppk = _indices(inverse(scores.mean() + reach * scores.std(ddof=1)), (lower, upper), len(x), len(x) - 1)
+        if within.std > 1e-12:
+            ends = inverse(scores.mean() + reach * within.std)
+            cp, cpk = _indices(ends, (lower, upper), len(x), within.freedom)
+    known = [value for value in stds or () if value is not None]
+    share = min(1.0, float(np.mean(np.square(known))) / std**2) if known else None
+    warnings = _doubts(scores, distribution, len(signals), size)
+    if share is not None and share > MAX_MEASUREMENT_SHARE:
+        warnings.append(f"{share:.0%} of the variance is due to the measurement, not to the parts")
     return Capability(
-        count,
-        mean,
-        std,
+        count=len(x),
+        mean=mean,
+        std=std,
         lower=lower,
         upper=upper,
         cp=cp,
-        cp_interval=cp_interval,
         cpk=cpk,
-        cpk_interval=(cpk - spread, cpk + spread),
-        is_in_control=chart.is_in_control,
+        pp=pp,
+        ppk=ppk,
+        is_in_control=not signals,
         measurement_share=share,
         warnings=tuple(warnings),
         distribution=distribution,
     )
 
 
-def capability_by_limits(series: ComponentSeries) -> dict[tuple[float | None, float | None], Capability | InputError]:
-    """Cp and Cpk of the values of each pair of limits, so that each value is judged by the limits that held for it.
+def _doubts(scores: Array, distribution: str, signals: int, size: int) -> list[str]:
+    """Doubts about indices that assume that the scores are normal and the process is in control."""
+    warnings = []
+    if len(scores) < ENOUGH_VALUES:
+        enough = ENOUGH_VALUES
+        warnings.append(f"only {len(scores)} values: the indices are rough, see their intervals ({enough} are enough)")
+    if signals:
+        warnings.append(
+            f"the process is not in control ({signals} of {len(scores) // size} values are signals): Pp and Ppk"
+            " describe the past, Cp and Cpk do not predict the future"
+        )
+    if not _is_normal(scores):
+        warnings.append(
+            f"the values do not follow the {distribution} distribution (Shapiro–Wilk, 1 %): the indices do not predict"
+            " reject rates"
+        )
+    return warnings
+
+
+def _indices(
+    ends: Array, limits: tuple[float | None, float | None], count: int, freedom: float
+) -> tuple[CapabilityIndex | None, CapabilityIndex]:
+    """The index of the width of both limits, and that of the nearer limit.
+
+    Args:
+        ends: (3,) percentiles 0.135, 50 and 99.865 %; the last one may be NaN: a power without that end.
+        limits: lower and upper.
+        count: number of values.
+        freedom: degrees of freedom of the standard deviation.
+    """
+    from scipy import stats
+
+    (low_end, middle, high_end), (lower, upper) = np.nan_to_num(ends, nan=np.inf).tolist(), limits
+    sides = [(upper - middle) / (high_end - middle)] if upper is not None else []
+    sides += [(middle - lower) / (middle - low_end)] if lower is not None else []
+    nearer = min(sides)
+    spread = float(stats.norm.ppf(0.975) * np.sqrt(1.0 / (9.0 * count) + nearer**2 / (2.0 * freedom)))
+    whole = None
+    if lower is not None and upper is not None:
+        width = (upper - lower) / (high_end - low_end)
+        low, high = width * np.sqrt(stats.chi2.ppf([0.025, 0.975], freedom) / freedom)
+        whole = CapabilityIndex(width, float(low), float(high))
+    return whole, CapabilityIndex(nearer, nearer - spread, nearer + spread)
+
+
+def _normalised(x: Array) -> tuple[Array, Callable[[Array], Array], str]:
+    """Normal scores of the values with their inverse: the values, or Box and Cox's power of those that are not normal.
+
+    The power is taken only if the scores are normal then.
+    """
+    from scipy import special, stats
+
+    if x.min() > 0.0 and not _is_normal(x):
+        made, power = stats.boxcox(x)
+        if _is_normal(made):
+            return made, lambda scores: special.inv_boxcox(scores, power), "Box–Cox"
+    return x, np.asarray, "normal"
+
+
+def _is_normal(scores: Array) -> bool:
+    from scipy import stats
+
+    return float(stats.shapiro(scores[:5000]).pvalue) >= NORMALITY_LEVEL
+
+
+def capability_by_limits(
+    series: ComponentSeries, size: int = 1
+) -> dict[tuple[float | None, float | None], Capability | InputError]:
+    """The indices of the values of each pair of limits, so that each value is judged by the limits that held for it.
 
     Where the indices cannot be given, the reason stands in their place.
     """
     found: dict[tuple[float | None, float | None], Capability | InputError] = {}
     for (lower, upper), values in series.by_limits().items():
         try:
-            stds = [one.std for one in values]
             absent = sum((one.lower, one.upper) == (lower, upper) for one in series.missing)
             if absent:
                 raise InputError(
                     f"capability: the component is missing on {absent} of {absent + len(values)} parts: an index of the"
                     " others would look better than the process is"
                 )
-            found[lower, upper] = capability([one.value for one in values], lower, upper, stds, series.is_length)
+            x, stds = [one.value for one in values], [one.std for one in values]
+            found[lower, upper] = capability(x, lower, upper, stds, series.is_length, size)
         except InputError as error:
             found[lower, upper] = error
     return found
@@ -283,20 +400,8 @@ def _length_percentiles(x: Array, upper: float | None) -> tuple[tuple[float, flo
     return percentiles, scores, name
 
 
-def _checked(values: ArrayLike, minimum: int, what: str) -> Array:
-    x = np.asarray(values, dtype=np.float64).ravel()
+def _check(x: Array, minimum: int, what: str, of: str = "values") -> None:
     if not np.isfinite(x).all():
         raise InputError(f"{what}: a value is NaN or infinite")
     if len(x) < minimum:
-        raise InputError(f"{what}: need at least {minimum} values, there {'is 1' if len(x) == 1 else f'are {len(x)}'}")
-    return x
-
-
-def _add_runs(signals: dict[int, str], signs: Array, length: int, reason: str) -> None:
-    """Add the values at which a run of one sign has reached a length."""
-    count, last = 0, 0.0
-    for index, sign in enumerate(signs):
-        count = count + 1 if sign == last and sign != 0.0 else int(sign != 0.0)
-        last = float(sign)
-        if count >= length:
-            signals.setdefault(index, reason)
+        raise InputError(f"{what}: need at least {minimum} {of}, there {'is 1' if len(x) == 1 else f'are {len(x)}'}")

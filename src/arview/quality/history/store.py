@@ -22,16 +22,15 @@ from sqlalchemy.exc import DBAPIError, IntegrityError, NoSuchModuleError, SQLAlc
 
 from arview.core.extras import install_command
 from arview.errors import InputError, MissingDependencyError, OutputError
-from arview.inspection import Inspection, content_hash, load_inspection, overall_verdict
+from arview.inspection import Inspection, content_hash, from_document, load_inspection, overall_verdict
 from arview.quality import decisions as quality
 from arview.quality.history.connection import (
     BUSY_S,
     begin_sqlite,
+    check_file,
     default_author,
     default_station,
-    file_system,
     is_temporary,
-    own_store,
     prepare_sqlite,
     store_url,
 )
@@ -39,12 +38,16 @@ from arview.quality.history.decided import decided_faults, decision_of_row, new_
 from arview.quality.history.tables import (
     STORE_VERSION,
     about,
+    add_missing,
+    characteristic_row,
+    characteristics,
     component_row,
     components,
     decisions,
     guards,
-    metadata,
     results,
+    same,
+    stored_version,
     voids,
 )
 
@@ -52,7 +55,6 @@ _TRIES = 6
 """Attempts after errors that may be temporary, unless another program holds a file."""
 WAIT_S = 40.0
 """Time after which it is not waited any longer for a program that holds a file."""
-_NETWORK_FILE_SYSTEMS = ("nfs", "nfs4", "cifs", "smb3", "smbfs", "fuse.sshfs", "9p", "afs", "glusterfs", "ceph")
 _LOCK = 0x61727669
 """Number of the advisory lock of PostgreSQL that is held while tables are created."""
 Found = TypeVar("Found")
@@ -109,7 +111,8 @@ class HistoryStore:
     Args:
         where: a file (SQLite), or the URL of a PostgreSQL database: ``postgresql://user@host/database``.
         must_exist: do not create a new file.
-        tell: called with a sentence when a new store is made, and when another program holds it for seconds.
+        tell: called with a sentence when a new store is made or an older one upgraded, and when another program holds
+            it for seconds.
 
     Raises:
         InputError: the file, its folder or the database does not exist, is no store, or is that of a newer arview.
@@ -125,7 +128,7 @@ class HistoryStore:
         self.name = url.render_as_string(hide_password=True) if url.host else str(url.database)
         self.is_sqlite = url.get_backend_name() == "sqlite"
         if self.is_sqlite:
-            self._check_file(Path(str(url.database)), must_exist)
+            check_file(Path(str(url.database)), must_exist, tell)
         try:
             self._engine = sa.create_engine(url, **({"connect_args": {"timeout": BUSY_S}} if self.is_sqlite else {}))
         except (ImportError, NoSuchModuleError) as error:
@@ -135,7 +138,7 @@ class HistoryStore:
         if self.is_sqlite:
             sa.event.listen(self._engine, "connect", prepare_sqlite)
             sa.event.listen(self._engine, "begin", begin_sqlite)
-        self._make_tables(upgrades=not must_exist)
+        self._make_tables()
 
     def close(self) -> None:
         """Close all connections."""
@@ -167,8 +170,8 @@ class HistoryStore:
             "serial": loaded.serial,
             "station": station or default_station(),
             "model_hash": loaded.model_hash,
-            "measured": _stamp(loaded.created),
-            "added": _stamp(datetime.now(UTC)),
+            "measured": stamp(loaded.created),
+            "added": stamp(datetime.now(UTC)),
             "verdict": overall_verdict(loaded).value,
             "tool": f"{loaded.provenance.tool} {loaded.provenance.version}",
             "document": json.dumps(document, ensure_ascii=False, allow_nan=False),
@@ -197,23 +200,21 @@ class HistoryStore:
         return self._retried(insert)
 
     def decisions(self, result_id: int) -> tuple[quality.Decision, ...]:
-        """The decisions, ticks and signatures about a result, in their order; none in the store of an older arview."""
+        """The decisions, ticks and signatures about a result, in their order."""
         return self.decided([result_id]).get(result_id, ())
 
     def decided(self, ids: Sequence[int]) -> dict[int, tuple[quality.Decision, ...]]:
         """The decisions, ticks and signatures about results, by their numbers."""
         found: dict[int, list[quality.Decision]] = {}
-        with self._begin() as connection:
-            if ids and sa.inspect(connection).has_table(decisions.name):
-                query = sa.select(decisions).where(decisions.c.result_id.between(min(ids), max(ids)))
-                for row in connection.execute(query.order_by(decisions.c.result_id, decisions.c.number)):
-                    found.setdefault(int(row.result_id), []).append(decision_of_row(row))
+        query = sa.select(decisions).where(decisions.c.result_id.between(min(ids, default=0), max(ids, default=-1)))
+        for row in self.rows(query.order_by(decisions.c.result_id, decisions.c.number)):
+            found.setdefault(int(row.result_id), []).append(decision_of_row(row))
         return {number: tuple(found[number]) for number in ids if number in found}
 
     def _insert(self, row: dict[str, Any], inspection: Inspection) -> AddedResult:
-        same = sa.select(results.c.id).where(results.c.content_hash == row["content_hash"])
+        known = sa.select(results.c.id).where(results.c.content_hash == row["content_hash"])
         with self._begin(writes=True) as connection:
-            existing = connection.scalar(same)
+            existing = connection.scalar(known)
             if existing is None:
                 try:
                     with connection.begin_nested():
@@ -224,8 +225,9 @@ class HistoryStore:
                     rows = [component_row(number, component) for component in inspection.components]
                     if rows:
                         connection.execute(sa.insert(components), rows)
+                    _insert_characteristics(connection, number, inspection)
                     return AddedResult(int(number), row["content_hash"], True)
-                existing = connection.scalar(same)
+                existing = connection.scalar(known)
             return AddedResult(int(existing or 0), row["content_hash"], False)
 
     def listed(
@@ -243,7 +245,7 @@ class HistoryStore:
             if value is not None:
                 query = query.where(results.c[name] == value)
         if since is not None:
-            query = query.where(results.c.measured >= _stamp(since))
+            query = query.where(results.c.measured >= stamp(since))
         query = query.order_by(results.c.measured.desc(), results.c.id.desc())
         with self._begin() as connection:
             voided = _voided(connection)
@@ -252,6 +254,11 @@ class HistoryStore:
             if limit is not None:
                 query = query.limit(limit)
             return [_listed(row, voided) for row in reversed(connection.execute(query).all())]
+
+    def rows(self, query: sa.Select[Any]) -> Sequence[Any]:
+        """The rows of a query of the tables of the store."""
+        with self._begin() as connection:
+            return connection.execute(query).all()
 
     def void(self, key: str, reason: str, by: str | None = None) -> StoredResult:
         """Void a result: it stays in the store with the reason, but lists, statistics and exports leave it out.
@@ -265,27 +272,56 @@ class HistoryStore:
             InputError: there is no such result, it is void already, or the reason is empty.
             OutputError: the store cannot be written to.
         """
-        reason = " ".join(reason.split())
-        if not reason:
-            raise InputError("void: the reason is empty")
-        self._make_tables(upgrades=True)
         found, _ = self.find(key)
-        row = {
-            "result_id": found.id, "reason": reason, "by": by or default_author(), "added": _stamp(datetime.now(UTC)),
-        }  # fmt: skip
-
-        def insert() -> bool:
-            with self._begin(writes=True) as connection:
-                if found.id in _voided(connection):
-                    return False
-                connection.execute(sa.insert(voids).values(row))
-                return True
-
-        is_new = self._retried(insert)
+        is_new = self._state(voids, {"result_id": found.id}, reason, by)
         found, _ = self.find(str(found.id))
         if not is_new and found.void is not None:
             raise InputError(f"{self.name}: result {found.id} is void already: {found.void.reason} ({found.void.by})")
         return found
+
+    def same(self, old: str, new: str, reason: str, by: str | None = None) -> tuple[str, str]:
+        """State that two CAD models are revisions of the same part, so that their series are joined.
+
+        Args:
+            old, new: first digits of the hashes of the models, which are returned in full.
+            reason, by: why their values can be compared, and who states it, as for `void`.
+
+        Raises:
+            InputError: not one model of the store has such a hash, both are the same, they are joined already, or the
+                reason is empty.
+            OutputError: the store cannot be written to.
+        """
+        known = [str(row.model_hash) for row in self.rows(sa.select(results.c.model_hash).distinct())]
+        pair = []
+        for key in (old, new):
+            found = [one for one in known if one.startswith(key.lower())]
+            if len(found) != 1:
+                raise InputError(
+                    f"{self.name}: {len(found)} CAD models have a hash that begins with {key!r}; expected one"
+                )
+            pair += found
+        if pair[0] == pair[1]:
+            raise InputError(f"{self.name}: both are the CAD model {pair[0][:12]}")
+        if not self._state(same, {"old_hash": pair[0], "new_hash": pair[1]}, reason, by):
+            raise InputError(f"{self.name}: {pair[0][:12]} and {pair[1][:12]} are joined already")
+        return pair[0], pair[1]
+
+    def _state(self, table: sa.Table, key: dict[str, Any], reason: str, by: str | None) -> bool:
+        """Add a statement with its reason, unless there is one with the key; whether it was added."""
+        reason = " ".join(reason.split())
+        if not reason:
+            raise InputError(f"{self.name}: the reason is empty")
+        row = {**key, "reason": reason, "by": by or default_author(), "added": stamp(datetime.now(UTC))}
+
+        def insert() -> bool:
+            with self._begin(writes=True) as connection:
+                conditions = [table.c[name] == value for name, value in key.items()]
+                if connection.scalar(sa.select(sa.func.count()).select_from(table).where(*conditions)):
+                    return False
+                connection.execute(sa.insert(table).values(row))
+                return True
+
+        return self._retried(insert)
 
     def find(self, key: str) -> tuple[StoredResult, str]:
         """A result and its document, found by its number or the first digits of its hash (at least six).
@@ -321,39 +357,22 @@ class HistoryStore:
 
         return stored_state(find(result.content_hash) or "", result.content_hash, entries, find)
 
-    def components(self, ids: list[int] | None = None, name: str | None = None) -> Iterator[dict[str, Any]]:
-        """Rows of the components of results, all or those of one name, in the order of ``ids`` or of the numbers."""
-        query = sa.select(components).order_by(components.c.result_id, components.c.name)
-        if name is not None:
-            query = query.where(components.c.name == name)
-        with self._begin() as connection:
-            rows = [dict(row._mapping) for row in connection.execute(query)]
-        if ids is None:
-            yield from rows
-            return
+    def components(self, ids: Sequence[int]) -> Iterator[dict[str, Any]]:
+        """Rows of the components of results, in the order of ``ids``, with names in alphabetical order."""
+        query = sa.select(components).where(components.c.result_id.between(min(ids, default=0), max(ids, default=-1)))
         by_result: dict[int, list[dict[str, Any]]] = {}
-        for row in rows:
-            by_result.setdefault(row["result_id"], []).append(row)
+        for row in self.rows(query.order_by(components.c.result_id, components.c.name)):
+            by_result.setdefault(row.result_id, []).append(dict(row._mapping))
         for number in ids:
             yield from by_result.get(number, ())
-
-    def details(self, ids: list[int], name: str) -> dict[int, dict[str, Any]]:
-        """The details of a component in the documents of results, by their numbers; empty where there are none."""
-        found: dict[int, dict[str, Any]] = {}
-        query = sa.select(results.c.id, results.c.document).where(results.c.id.in_(ids))
-        with self._begin() as connection:
-            for row in connection.execute(query.execution_options(yield_per=200)):
-                for entry in json.loads(row.document)["components"]:
-                    if entry["name"] == name:
-                        found[int(row.id)] = entry.get("details") or {}
-        return found
 
     def check(self) -> tuple[int, list[str]]:
         """The number of results, and descriptions of those that were altered after they were added."""
         faults = []
         count = 0
         query = sa.select(results.c.id, results.c.content_hash, results.c.document).order_by(results.c.id)
-        counted = sa.select(components.c.result_id, sa.func.count()).group_by(components.c.result_id)
+        every = sa.union_all(sa.select(components.c.result_id), sa.select(characteristics.c.result_id)).subquery()
+        counted = sa.select(every.c.result_id, sa.func.count()).group_by(every.c.result_id)
         with self._begin() as connection:
             of_result = {int(number): int(rows) for number, rows in connection.execute(counted)}
             for row in connection.execute(query.execution_options(yield_per=200)):
@@ -361,8 +380,10 @@ class HistoryStore:
                 document = json.loads(row.document)
                 if content_hash(document) != row.content_hash:
                     faults.append(f"result {row.id}: its document does not have the hash {row.content_hash[:12]}…")
-                elif len(document["components"]) != of_result.get(row.id, 0):
-                    faults.append(f"result {row.id}: its number of components has changed")
+                    continue
+                names = {one["name"] for one in document.get("characteristics", ())}
+                if len(document["components"]) + len(names) != of_result.get(row.id, 0):
+                    faults.append(f"result {row.id}: its number of components or characteristics has changed")
         for number, entries in self.decided(list(of_result)).items():
             faults += [f"result {number}: {fault}" for fault in decided_faults(entries)]
         return count, faults
@@ -406,60 +427,36 @@ class HistoryStore:
                 time.sleep(0.05 * 2 ** min(attempt, 5) * random.uniform(0.5, 1.5))
         raise AssertionError("unreachable")
 
-    def _make_tables(self, upgrades: bool) -> None:
-        """Create the tables of a new store, and with ``upgrades`` those that an older one lacks."""
+    def _make_tables(self) -> None:
+        """Create the tables of a new store, and in an older one those that it lacks."""
+
+        def read_version() -> int:
+            with self._begin(retries=True) as connection:
+                return stored_version(connection)
 
         def make() -> None:
             with self._begin(writes=True) as connection:
                 if not self.is_sqlite:
                     connection.execute(sa.text("SELECT pg_advisory_xact_lock(:lock)"), {"lock": _LOCK})
-                metadata.create_all(connection)
+                version = stored_version(connection)
+                if version == STORE_VERSION:  # another program made them in the meantime
+                    return
+                add_missing(connection)
                 for statement in guards("sqlite" if self.is_sqlite else "postgresql"):
                     connection.exec_driver_sql(statement)
-                version = connection.scalar(sa.select(sa.func.max(about.c.version)))
-                if version is None or version < STORE_VERSION:
-                    connection.execute(sa.insert(about).values(version=STORE_VERSION))
-                elif version > STORE_VERSION:
-                    raise InputError(
-                        f"{self.name}: the store was written by a newer arview (version {version}); update arview"
-                    )
+                having = results.c.document.contains('"characteristics"')
+                stored = sa.select(results.c.id, results.c.document).where(having)
+                for row in connection.execute(stored).all() if version else ():
+                    _insert_characteristics(connection, row.id, from_document(json.loads(row.document)))
+                connection.execute(sa.insert(about).values(version=STORE_VERSION))
 
-        def has_tables() -> bool:
-            with self._begin(retries=True) as connection:
-                if not sa.inspect(connection).has_table(about.name):
-                    return False
-                version = connection.scalar(sa.select(sa.func.max(about.c.version)))
-            if version is not None and version > STORE_VERSION:
-                raise InputError(
-                    f"{self.name}: the store was written by a newer arview (version {version}); update arview"
-                )
-            return version is not None and (version == STORE_VERSION or not upgrades)
-
-        if not self._retried(has_tables):
+        version = self._retried(read_version)
+        if version > STORE_VERSION:
+            raise InputError(f"{self.name}: the store was written by a newer arview (version {version}); update arview")
+        if version < STORE_VERSION:
+            if version:
+                self._tell(f"{self.name}: the store of an older arview is upgraded; its results stay as they are")
             self._retried(make)
-
-    def _check_file(self, path: Path, must_exist: bool) -> None:
-        if not path.exists():
-            if must_exist:
-                raise InputError(f"{path}: no such store; `arview history add` creates it")
-            if not path.parent.is_dir():
-                if path != own_store():
-                    raise InputError(
-                        f"{path.parent}: no such folder for a store; create it, or mount the share that it is on"
-                    )
-                try:
-                    path.parent.mkdir(parents=True, exist_ok=True)
-                except OSError as error:
-                    raise OutputError(f"{path.parent}: cannot be created ({error.strerror or error})") from error
-            self._tell(f"{path}: a new store is made, there was none")
-        elif path.is_dir():
-            raise InputError(f"{path}: is a folder; expected the file of a store")
-        kind = file_system(path)
-        if kind in _NETWORK_FILE_SYSTEMS:
-            raise InputError(
-                f"{path}: is on a network file system ({kind}), on which SQLite is not safe with several writers;"
-                " use PostgreSQL (--store postgresql://…)"
-            )
 
     def _message(self, error: SQLAlchemyError) -> str:
         cause = error.orig if isinstance(error, DBAPIError) and error.orig is not None else error
@@ -477,14 +474,19 @@ class _Failure(OutputError):
         self.is_temporary = is_temporary
 
 
-def _stamp(moment: datetime) -> str:
+def stamp(moment: datetime) -> str:
+    """A time as the store holds it: UTC, so that texts sort as their times do."""
     return moment.astimezone(UTC).strftime("%Y-%m-%dT%H:%M:%S.%fZ")
 
 
+def _insert_characteristics(connection: sa.Connection, number: int, inspection: Inspection) -> None:
+    rows = {one.name: characteristic_row(number, one) for one in inspection.characteristics}
+    if rows:
+        connection.execute(sa.insert(characteristics), list(rows.values()))
+
+
 def _voided(connection: sa.Connection) -> dict[int, Void]:
-    """The voids by the number of their result; none in the store of an older arview."""
-    if not sa.inspect(connection).has_table(voids.name):
-        return {}
+    """The voids by the number of their result."""
     rows = connection.execute(sa.select(voids))
     return {int(row.result_id): Void(row.reason, row.by, datetime.fromisoformat(row.added)) for row in rows}
 
