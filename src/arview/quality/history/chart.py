@@ -99,7 +99,7 @@ def _tolerance(axes: Any, series: ComponentSeries) -> None:
         elif np.isfinite(heights).any():
             axes.stairs(heights, places, baseline=None, color=INK, linewidth=1.1)
         if now is not None:
-            text = f"tolerance {now:+.3f}" if series.lower is not None else f"tolerance {now:.3f}"
+            text = f"tolerance {now:+.3f}" if (series.lower or 0.0) < 0.0 else f"tolerance {now:.3f}"
             _note(axes, text.replace("-", "−"), (1.0, now), INK, **_AT_END, xytext=(-2, 3), ha="right")
 
 
