@@ -79,6 +79,13 @@ def test_csv_has_a_line_for_each(found: Inspection) -> None:
     assert "characteristic" not in to_csv(found).splitlines()[0]
 
 
+def test_csv_for_spreadsheets_with_decimal_commas(found: Inspection) -> None:
+    rows = list(csv.DictReader(io.StringIO(to_csv(found, of="characteristics", decimal=",")), delimiter=";"))
+    assert (rows[0]["value_mm"], rows[0]["zone_mm"], rows[0]["datums"]) == ("0,421", "0,6", "A B(M)")
+    whole = list(csv.DictReader(io.StringIO(to_csv(found, decimal=",")), delimiter=";"))
+    assert whole[0]["distance_mm"].startswith("0,1") and "." not in whole[0]["distance_mm"]
+
+
 def test_dfq_has_both_limits(found: Inspection) -> None:
     fields = dict(line.split(" ", 1) for line in to_dfq(found).decode("cp1252", "replace").splitlines() if " " in line)
     index = next(key.split("/")[1] for key, value in fields.items() if key.startswith("K2001/") and value == "width")

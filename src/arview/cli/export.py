@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import Literal
 
 import click
 
@@ -70,6 +71,7 @@ src/arview/inspection/schema/inspection-json.md and by the JSON Schema next to i
 @click.option("--part", "part_path", metavar="PART", help="Part file or CAD file, for glb, html and pdf.")
 @click.option("--folder", metavar="OUT", help="Folder of `arview reconstruct`, for html and pdf.")
 @click.option("--photos", metavar="FOLDER", help="Folder of the photos, for html and pdf.")
+@click.option("--decimal-comma", is_flag=True, help="CSV with decimal commas and semicolons.")
 @UNIT
 def export(
     inspection: str,
@@ -78,6 +80,7 @@ def export(
     part_path: str | None,
     folder: str | None,
     photos: str | None,
+    decimal_comma: bool,
     unit: str | None,
 ) -> None:
     """Write INSPECTION in other formats."""
@@ -98,9 +101,11 @@ def export(
     content = decisions.log_of(source).content()
     for line in (*content.faults, *content.notices):
         say(line)
+    decided = decisions.decided_cells(content.entries)
+    decimal: Literal[".", ","] = "," if decimal_comma else "."
     made: dict[str, Callable[[], bytes]] = {
-        "csv": lambda: to_csv(loaded, sha256, decisions.decided_cells(content.entries)).encode("utf-8"),
-        "characteristics": lambda: to_csv(loaded, sha256, of="characteristics").encode("utf-8"),
+        "csv": lambda: to_csv(loaded, sha256, decided, decimal=decimal).encode("utf-8"),
+        "characteristics": lambda: to_csv(loaded, sha256, of="characteristics", decimal=decimal).encode("utf-8"),
         "decisions": lambda: decisions.decisions_csv(content.entries, loaded.part, loaded.serial).encode("utf-8"),
         "qif": lambda: to_qif(loaded, sha256),
         "dfq": lambda: to_dfq(loaded, sha256),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Literal
 
 from arview.inspection.details import MEASURANDS
@@ -63,6 +63,7 @@ def to_csv(
     sha256: str | None = None,
     decided: Mapping[str, tuple[str, str, str, str]] | None = None,
     of: Literal["components", "characteristics"] = "components",
+    decimal: Literal[".", ","] = ".",
 ) -> str:
     """The inspection as CSV with the columns of `HEADER`, or of `CHARACTERISTIC_HEADER`; lines end with CR LF.
 
@@ -73,36 +74,43 @@ def to_csv(
         sha256: fingerprint of the file it was read from; default: that of the inspection.
         decided: decision, reason, name and time of people's decisions about components, by their names.
         of: what there is a line for.
+        decimal: with a comma cells are separated by semicolons, as spreadsheets in most of Europe read them.
     """
     sha256 = sha256 or fingerprint(inspection)
+    rows: list[Sequence[str]] = [HEADER]
     if of == "characteristics":
-        return _characteristics(inspection, sha256)
+        rows = [CHARACTERISTIC_HEADER, *_characteristics(inspection, sha256)]
+    else:
+        for one in inspection.components:
+            person = (decided or {}).get(one.name, ("", "", "", ""))
+            rows.append((*_row(inspection, one), sha256, _point(one), *person))
     out = io.StringIO(newline="")
-    writer = csv.writer(out)
-    writer.writerow(HEADER)
-    for component in inspection.components:
-        person = (decided or {}).get(component.name, ("", "", "", ""))
-        writer.writerow([_text(cell) for cell in (*_row(inspection, component), sha256, _point(component), *person)])
+    writer = csv.writer(out, delimiter="," if decimal == "." else ";")
+    writer.writerows([[_text(cell, decimal) for cell in row] for row in rows])
     return out.getvalue()
 
 
-def _characteristics(inspection: Inspection, sha256: str) -> str:
-    """The characteristics as CSV with the columns of `CHARACTERISTIC_HEADER`."""
-    head = [inspection.part, inspection.serial, inspection.created.strftime("%Y-%m-%dT%H:%M:%SZ")]
-    out = io.StringIO(newline="")
-    writer = csv.writer(out)
-    writer.writerow(CHARACTERISTIC_HEADER)
+def _characteristics(inspection: Inspection, sha256: str) -> Iterator[list[str]]:
+    """Rows of the characteristics."""
     for one in inspection.characteristics:
-        value = "" if one.value_mm is None else one.value_text.lstrip("S⌀")
-        cells = [*head, one.name, one.kind, ", ".join(one.of), " ".join(one.datums), one.verdict.value, value]
-        cells += [
+        yield [
+            inspection.part,
+            inspection.serial,
+            inspection.created.strftime("%Y-%m-%dT%H:%M:%SZ"),
+            one.name,
+            one.kind,
+            ", ".join(one.of),
+            " ".join(one.datums),
+            one.verdict.value,
+            "" if one.value_mm is None else one.value_text.lstrip("S⌀"),
             _rounded(one.uncertainty_mm, decimals_of(one.uncertainty_mm)),
             "" if one.zone_mm is None else one.zone,
+            *(_exact(number) for number in (one.zone_mm, one.bonus_mm or None, *one.limits_mm, one.nominal_mm)),
+            one.reason,
+            "; ".join(one.notes),
+            one.source,
+            sha256,
         ]
-        cells += [_exact(number) for number in (one.zone_mm, one.bonus_mm or None, *one.limits_mm, one.nominal_mm)]
-        cells += [one.reason, "; ".join(one.notes), one.source, sha256]
-        writer.writerow([_text(cell) for cell in cells])
-    return out.getvalue()
 
 
 def _row(inspection: Inspection, one: ComponentDeviation) -> list[str]:
@@ -157,9 +165,11 @@ def _exact(value: float | None) -> str:
     return "" if value is None else exact(value)
 
 
-def _text(cell: str) -> str:
+def _text(cell: str, decimal: str) -> str:
     """A cell; texts, unlike numbers, that a spreadsheet would read as a formula are prefixed with an apostrophe."""
-    return f"'{cell}" if cell[:1] in ("=", "+", "-", "@", "\t") and not _is_number(cell) else cell
+    if _is_number(cell):
+        return cell.replace(".", decimal)
+    return f"'{cell}" if cell[:1] in ("=", "+", "-", "@", "\t") else cell
 
 
 def _is_number(cell: str) -> bool:
