@@ -98,6 +98,9 @@ def build_context(evidence: ReportEvidence, progress: Progress) -> dict[str, Any
     }
     context |= _components(evidence) | _findings(evidence, gallery)
     context["characteristics"] = [_characteristic(one) for one in _by_excess(inspection)]
+    for row in context["characteristics"]:
+        if row["name"] in gallery.characteristics:
+            row["crop"] = _crop(gallery.characteristics[row["name"]], "ring: its nominal place")
     context["numbered"] = [_characteristic(one) for one in inspection.characteristics]
     context |= _distance_map(evidence) | _budget(inspection) | _datums(inspection)
     context |= repeatability_context(inspection) | decisions_context(evidence)

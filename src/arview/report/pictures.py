@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -15,7 +15,7 @@ from arview.camera import Camera
 from arview.core.progress import StepProgress
 from arview.errors import InputError
 from arview.geometry import Array, apply, look_at
-from arview.inspection import ComponentDeviation, ForeignReport, Inspection, Verdict
+from arview.inspection import CharacteristicResult, ComponentDeviation, ForeignReport, Inspection, Verdict
 from arview.overlay import paint
 from arview.pose import Pose, TrackingState
 from arview.rendering import ZBufferRenderer
@@ -38,6 +38,8 @@ ARROW_SHARE = 0.3
 """Largest length of the arrow as a share of the width of the crop."""
 APART_DEG = 40.0
 """Smallest angle between the lines of sight of two crops."""
+SURROUNDINGS_MM, MARK_PX = 50.0, 60.0
+"""Size of what is shown about the place of a characteristic, and radius of the ring that marks it."""
 MAX_PX = 400
 """Longer side of the renderings that determine the visibility."""
 
@@ -64,12 +66,18 @@ class Gallery:
     Attributes:
         components: crops by the name of the component.
         foreign: crops of each foreign object.
+        characteristics: crop of each characteristic that fails, by its name.
         unread: reasons why photos could not be read.
     """
 
     components: dict[str, tuple[Crop, ...]]
     foreign: tuple[tuple[Crop, ...], ...]
     unread: tuple[str, ...]
+    characteristics: dict[str, Crop] = field(default_factory=dict)
+
+
+Shown = str | int | CharacteristicResult
+"""What a crop shows: the component of a name, the foreign object of an index, or a characteristic."""
 
 
 def make_gallery(
@@ -88,15 +96,17 @@ def make_gallery(
     """
     report_progress = progress or (lambda done, total: None)
     ranking = _PhotoRanking(model, sparse.photos)
-    wanted: list[tuple[str | int, list[int]]] = [
+    wanted: list[tuple[Shown, list[int]]] = [
         (one.name, ranking.best_of(one, 1 if one.verdict is Verdict.PASS else 2)) for one in inspection.components
     ]
     wanted += [(index, ranking.best_of_box(one)) for index, one in enumerate(inspection.foreign_objects)]
-    by_photo: dict[int, list[str | int]] = {}
+    failed = [one for one in inspection.characteristics if one.verdict is Verdict.FAIL and one.point_mm]
+    wanted += [(one, ranking.best_of_box(_surroundings(one))[:1]) for one in failed]
+    by_photo: dict[int, list[Shown]] = {}
     for key, photos in wanted:
         for index in photos:
             by_photo.setdefault(index, []).append(key)
-    crops: dict[tuple[str | int, int], Crop] = {}
+    crops: dict[tuple[Shown, int], Crop] = {}
     unread: list[str] = []
     for done, (index, keys) in enumerate(by_photo.items()):
         report_progress(done, len(by_photo))
@@ -114,6 +124,8 @@ def make_gallery(
                 deviation = inspection.find(key)
                 assert deviation is not None
                 crops[key, index] = _component_crop(deviation, inspection, model, photo, image)
+            elif isinstance(key, CharacteristicResult):
+                crops[key, index] = _point_crop(key, photo, image)
             else:
                 crops[key, index] = _foreign_crop(inspection.foreign_objects[key], photo, image)
     report_progress(len(by_photo), len(by_photo))
@@ -122,6 +134,7 @@ def make_gallery(
         {key: value for key, value in found.items() if isinstance(key, str)},
         tuple(found[index] for index in range(len(inspection.foreign_objects))),
         tuple(unread),
+        {one.name: found[one][0] for one in failed if found[one]},
     )
 
 
@@ -279,6 +292,22 @@ def _component_crop(
     pose = Pose(photo.cam_from_scan, None, 1.0, TrackingState.TRACKED, 0.0, 0)
     picture = overlay.OverlayRenderer(model, camera, alone, drawn).draw(crop, pose)
     return Crop(picture, photo.name, scale)
+
+
+def _surroundings(one: CharacteristicResult) -> ForeignReport:
+    """A box about the place of a characteristic, large enough to see what it is on."""
+    x, y, z = one.point_mm
+    return ForeignReport((x, y, z), (SURROUNDINGS_MM,) * 3, 0.0, "", 0.0, "")
+
+
+def _point_crop(one: CharacteristicResult, photo: reconstruction.PosedPhoto, image: RgbImage) -> Crop:
+    """A crop about the place of a characteristic, which a ring marks."""
+    crop, camera = _cut(image, photo, np.array(one.point_mm) + 0.5 * SURROUNDINGS_MM * _UNIT_CORNERS)
+    middle = camera.project(apply(photo.cam_from_scan, np.array(one.point_mm)))
+    turn = np.linspace(0.0, 2.0 * np.pi, 49)
+    ring = middle + MARK_PX * np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    paint.line(crop, ring, overlay.VERDICT_RGB[one.verdict], 2)
+    return Crop(crop, photo.name, None)
 
 
 def _foreign_crop(one: ForeignReport, photo: reconstruction.PosedPhoto, image: RgbImage) -> Crop:
