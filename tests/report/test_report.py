@@ -20,13 +20,14 @@ from arview.cad.part import ComponentSettings, Part
 from arview.cli import main
 from arview.errors import MismatchError, MissingDependencyError
 from arview.geometry import Array, apply, exp_so3, invert, rigid
-from arview.inspection import Inspection, save_inspection
+from arview.inspection import CharacteristicResult, Inspection, Verdict, save_inspection
 from arview.measurement.cloud.distance_map import (
     distance_map,
     read_distance_ply,
     write_distance_ply,
 )
 from arview.measurement.folder import MetricReconstruction
+from arview.overlay.options import VERDICT_RGB
 from arview.reconstruction.scale.types import Consistency, ScaleResult
 from arview.reconstruction.types import DenseCloud, PosedPhoto, SparseModel
 from arview.rendering.rasterizer import rasterise
@@ -189,6 +190,26 @@ def test_the_ghost_lies_on_the_block_in_the_photo(
         max(0, bent[:, 1].min() - 6) : bent[:, 1].max() + 6, max(0, bent[:, 0].min() - 6) : bent[:, 0].max() + 6
     ]
     assert (near & cut).sum() / (near | cut).sum() > 0.8  # the rest is due to rounding at the rim and the holes
+
+
+@pytest.mark.slow
+def test_a_failing_characteristic_has_a_picture_with_a_ring_at_its_place(
+    model: Model, found: Inspection, reconstruction: MetricReconstruction
+) -> None:
+    place = model.component("block_1").bounds_in_model.mean(axis=0)
+    failed = CharacteristicResult(
+        "top", "position", ("top",), Verdict.FAIL, value_mm=0.5, uncertainty_mm=0.1, zone_mm=0.2,
+        point_mm=tuple(place.tolist()),
+    )  # fmt: skip
+    passed = replace(failed, name="other", verdict=Verdict.PASS, value_mm=0.05)
+    gallery = make_gallery(replace(found, characteristics=(passed, failed)), model, in_datum_frame(reconstruction))
+    assert set(gallery.characteristics) == {"top"}
+    image = gallery.characteristics["top"].image
+    is_red = np.all(np.abs(image.astype(int) - VERDICT_RGB[Verdict.FAIL]) < 30, axis=2)
+    rows, columns = np.nonzero(is_red)
+    assert len(rows) > 200
+    middle = np.array([columns.mean(), rows.mean()])
+    assert np.hypot(columns - middle[0], rows - middle[1]) == pytest.approx(pictures.MARK_PX, abs=4.0)
 
 
 @pytest.mark.slow
