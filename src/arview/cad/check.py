@@ -113,6 +113,8 @@ class PartCheck:
             f"{self.camera.width}×{self.camera.height}, focal length {self.camera.fx:.0f} px",
         ]
         lines += [f"  datum {datum.label}: {datum.feature} of {datum.component}" for datum in self.part.datums]
+        lines += [f"  feature {one.label}: {one.feature} of {one.component}" for one in self.part.features]
+        lines += [f"  characteristic {one.name}: {one.kind}" for one in self.part.characteristics]
         tree = tree_lines(self.part.paths)
         lines += ["", *tree] if tree else []
         if tree:
