@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from arview.cad import Component, Datum, DatumFeature
 from arview.core.fits import orthogonal_complement
 from arview.geometry import Array
-from arview.measurement.datums.alignment import Alignment, contribution
+from arview.measurement.datums.alignment import FORM_MM, Alignment, contribution
 from arview.measurement.datums.cad_features import edge_line, flat_faces, round_faces
 from arview.measurement.datums.datum_fit import DatumFit, check_fit_covered, fit_datum
 from arview.measurement.datums.directions import observable_directions, shift_origin
@@ -38,7 +38,7 @@ MAX_MOVE_MM = 2.0 * REACH_MM
 """Displacement of any part of a feature beyond which it was matched wrongly: it is searched for within half of that."""
 MIN_SPAN = 0.5
 """Share of a face's length and width over which it must be measured: a strip in a gap is matched wrongly."""
-RADIUS_PX = 0.03
+RADIUS_PX = 0.02
 """Standard uncertainty of a radius by where along the step of brightness the edge is taken to be, px of the photos."""
 
 
@@ -178,7 +178,7 @@ def _solved(
         gain[6] = solution[count]
     covariance = contribution(gain, one, fit)
     if one.by_radius is not None:
-        covariance[6, 6] += (RADIUS_PX * px_mm) ** 2
+        covariance[6, 6] += (RADIUS_PX * px_mm) ** 2 + FORM_MM**2
     state = gain @ one.offsets_mm
     across = point_from_move(places - center)[:, :, :6] @ state[:6]
     in_plane = orthogonal_complement(axis[None]).T
