@@ -46,14 +46,14 @@ def more(scene: FeatureScene) -> tuple[Characteristic, ...]:
         Characteristic("flatness", "flatness", ("A",), 0.2),
         Characteristic("profile", "profile", ("A",), 0.3, datums=EVERYTHING),
         Characteristic("size of B", "size", ("B",), limits_mm=(11.8, 12.2)),
-        Characteristic("underside", "profile", ("underside",), 0.3, datums=EVERYTHING),
+        Characteristic("underside", "position", ("underside",), 0.3, datums=EVERYTHING),
     )
 
 
 @pytest.fixture(scope="module")
 def scene() -> FeatureScene:
     made = feature_scene(1, columns=4, rows=2)
-    underside = Datum("underside", "plane", "plate", (0.0, 0.0, -8.0), (0.0, 0.0, -1.0))
+    underside = Datum("underside", "point", "plate", (0.0, 0.0, -8.0), (0.0, 0.0, -1.0))
     part = replace(
         made.part,
         features=(*made.part.features, underside),
@@ -147,7 +147,7 @@ def test_what_was_not_seen_is_said_and_does_not_pass(inspection: Inspection) -> 
     assert rim.verdict is underside.verdict is Verdict.NOT_MEASURED
     block = result(inspection, "tilt of a block")
     assert block.value_mm is not None and 0.0 < block.value_mm < 0.1 and block.verdict is Verdict.PASS
-    assert "does not determine its tilt" in rim.reason and "underside (plane)" in underside.reason
+    assert "does not determine its tilt" in rim.reason and "underside (point)" in underside.reason
 
 
 def test_form_of_a_flat_plate(inspection: Inspection) -> None:

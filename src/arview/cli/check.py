@@ -23,7 +23,7 @@ Examples:
   arview check part.toml
   arview check housing.stl --unit mm --camera fov:65
   arview check left.step --against right.step
-  arview check bracket.step --pmi > part.toml""",
+  arview check bracket.step --pmi""",
 )
 @click.argument("part")
 @UNIT

@@ -171,7 +171,8 @@ def _print(inspection: Inspection, target: Path) -> None:
             f"distances of the cloud to the CAD: {whole.count} points, mean {whole.mean_mm:+.3f}, sigma "
             f"{whole.sigma_mm:.3f}, FWHM {whole.fwhm_mm:.3f} mm"
         )
-    click.echo(verdict_sentence(inspection))
+    missing = [c.name for c in inspection.components if c.finding is not None]
+    click.echo(verdict_sentence(inspection) + (f"; missing: {', '.join(missing)}" if missing else ""))
     click.echo(f"wrote {target}")
     if inspection.distance_map is not None and inspection.distance_map.files:
         cloud, *pictures = inspection.distance_map.files

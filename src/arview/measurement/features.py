@@ -165,7 +165,9 @@ def _solved(
     rows = one.rows[:, :6] - one.rows[:, 3:6] @ shift_origin(center)[:, :6]
     unit = _unit(reach_mm)
     allowed = np.eye(6)[:, 3:] if is_rim or datum.feature == "point" else np.eye(6)
-    columns = observable_directions(rows * unit, allowed, fit.weights)
+    # The equations of a whole move are its principal directions, of which some are far more certain.
+    trusted = np.ones(len(rows)) if one.feature == "fit" else fit.weights
+    columns = observable_directions(rows * unit, allowed, trusted)
     design = rows @ (columns * unit[:, None])
     if one.by_radius is not None:
         design = np.concatenate([design, one.by_radius[:, None]], axis=1)
