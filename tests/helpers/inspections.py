@@ -62,7 +62,7 @@ def deviation(
         notes=("held by its edges alone",),
     )  # fmt: skip
     return ComponentDeviation(
-        name, moved, distance, seen, uncertainty_mm, tolerance_mm, verdict, tilt_deg=0.0, twist_deg=turn_deg,
+        name, moved, distance, (seen[0], seen[1], seen[2], seen[3], seen[4], seen[5]), uncertainty_mm, tolerance_mm, verdict, tilt_deg=0.0, twist_deg=turn_deg,
         details=details,
     )  # fmt: skip
 

@@ -106,6 +106,9 @@ def feature_of(
         DatumNotMeasuredError: too little of it was found.
     """
     axis, point = np.array(datum.direction_in_model), np.array(datum.point_in_model)
+    ways = [one for one in ways if len(one.points)]
+    if not ways:
+        raise DatumNotMeasuredError(f"datum {datum.label} ({datum.feature}): none of it was seen")
     middle = ways[0].points.mean(axis=0)
     places = _places(datum, component)
     # A rim is centred on its axis, at the end that is seen; a face or an edge in its own middle.
