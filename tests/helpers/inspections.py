@@ -32,7 +32,7 @@ def deviation(
     uncertainty_mm: float = 0.06, turn_deg: float = 0.0, angle_tolerance_deg: float | None = None,
 ) -> ComponentDeviation:  # fmt: skip
     """A component with a displacement and a rotation about z; the verdict follows ISO 14253-1."""
-    seen = (True, True, True, *(value is not None for value in moved))
+    x, y, z = (value is not None for value in moved)
     distance = float(np.linalg.norm([value or 0.0 for value in moved]))
     rotation = exp_so3(np.array([0.0, 0.0, np.deg2rad(turn_deg)]))
     shift = np.array([value or 0.0 for value in moved])
@@ -62,8 +62,8 @@ def deviation(
         notes=("held by its edges alone",),
     )  # fmt: skip
     return ComponentDeviation(
-        name, moved, distance, (seen[0], seen[1], seen[2], seen[3], seen[4], seen[5]), uncertainty_mm, tolerance_mm, verdict, tilt_deg=0.0, twist_deg=turn_deg,
-        details=details,
+        name, moved, distance, (True, True, True, x, y, z), uncertainty_mm, tolerance_mm, verdict,
+        tilt_deg=0.0, twist_deg=turn_deg, details=details,
     )  # fmt: skip
 
 
