@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 
@@ -58,7 +59,7 @@ class Frames:
     scale_std: float
     poses: PosePropagation | None
 
-    def of(self, labels: Sequence[str]) -> tuple[Alignment, PosePropagation | None]:
+    def of(self, labels: tuple[str, ...]) -> tuple[Alignment, PosePropagation | None]:
         """The frame of some datums in an order of precedence.
 
         Raises:
@@ -136,6 +137,7 @@ class _Decisions:
 
     def __init__(self, part: Part, features: Mapping[str, MeasuredFeature | str], frames: Frames, guard: float) -> None:
         self.part, self.features, self.frames, self.guard = part, features, frames, guard
+        self._frame_of = cache(frames.of)  # the errors of the poses are worked out anew for each
         self.datums = {datum.label: datum for datum in (*part.datums, *part.features)}
         self.sizes: dict[str, tuple[float, float]] = {}
         """By feature: how far its size is off maximum material, and U, mm."""
@@ -202,7 +204,7 @@ class _Decisions:
         self, one: Characteristic, features: list[MeasuredFeature], empty: CharacteristicResult
     ) -> CharacteristicResult:
         """A characteristic with a tolerance zone."""
-        alignment, poses = self.frames.of(one.datums)
+        alignment, poses = self._frame_of(one.datums)
         state, covariance = joint_state(features, alignment, poses)
         zone = _zone_of(one, features, self._free_motions(one, alignment), alignment.origin_in_model)
         form = features[0].form

@@ -204,9 +204,7 @@ def _solved(
         state=state,
         covariance=covariance,
         undetermined=np.concatenate([free, np.zeros((len(free), 1))], axis=1),
-        by_poses=np.zeros((STATE, 0))
-        if poses is None
-        else gain @ poses.offsets(one.rows, one.points, one.feature == "fit"),
+        by_poses=np.zeros((STATE, 0)) if poses is None else gain @ poses.offsets(one),
         form=_form(one, fit, one.offsets_mm - design @ solution @ one.offsets_mm, axis)
         if one.feature == "plane"
         else None,

@@ -6,6 +6,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -19,11 +20,12 @@ from arview.errors import InputError
 from arview.geometry import Array
 from arview.inspection import CharacteristicResult, DistanceReport, FailedDatum, ForeignReport, Inspection
 from arview.measurement.characteristics import OF_WHOLE_NOTE, Frames, MeasureFeature, measure_characteristics
+from arview.measurement.cloud.points import CloudPoints
 from arview.measurement.cloud_report import inspect_cloud, scatter_doubts
 from arview.measurement.datums.alignment import Alignment, align
 from arview.measurement.datums.datum_fit import check_covered
 from arview.measurement.datums.equations import DatumEquations, DatumNotMeasuredError, move_equations
-from arview.measurement.datums.in_cloud import measure_datums_in_cloud
+from arview.measurement.datums.in_cloud import measure_datum_in_cloud, points_for_datums
 from arview.measurement.datums.in_photos import measure_datums_in_photos, measure_plane_in_photos
 from arview.measurement.datums.partial import MeasureDatum, measure_each
 from arview.measurement.datums.plane_edges import with_form
@@ -272,11 +274,15 @@ def _datum_measurement(
 ) -> MeasureDatum:
     """The function that measures one datum, in the photos or in the cloud."""
 
+    @cache
+    def points() -> CloudPoints:
+        assert reconstruction.cloud is not None
+        return points_for_datums(part.model, reconstruction.cloud)
+
     def measure_one(datum: Datum) -> DatumEquations:
         if views is not None:
             return measure_datums_in_photos((datum,), views, fitted)[0]
-        assert reconstruction.cloud is not None
-        return measure_datums_in_cloud((datum,), part.model, reconstruction.cloud, fitted)[0]
+        return measure_datum_in_cloud(datum, part.model, points(), fitted)
 
     return measure_one
 

@@ -59,13 +59,22 @@ def measure_datums_in_cloud(
     """
     if not datums:
         return []
+    points = points_for_datums(model, cloud)
+    return [measure_datum_in_cloud(datum, model, points, moves) for datum in datums]
+
+
+def points_for_datums(model: Model, cloud: DenseCloud) -> CloudPoints:
+    """The points of a cloud near the part, averaged on the grid in which datums and features are measured.
+
+    Raises:
+        InputError: too few points of the cloud are near the part.
+    """
     grid_mm = _GRID_MM / enlargement(model)
-    points = prepare_cloud(cloud, model.bounds_in_model + np.array([[-5.0], [5.0]]), grid_mm, _MIN_CLOUD_POINTS)
-    return [_measure(datum, model, points, moves) for datum in datums]
+    return prepare_cloud(cloud, model.bounds_in_model + np.array([[-5.0], [5.0]]), grid_mm, _MIN_CLOUD_POINTS)
 
 
-def _measure(datum: Datum, model: Model, cloud: CloudPoints, moves: Mapping[str, Move]) -> DatumEquations:
-    """Offsets of one datum, by the method for its feature."""
+def measure_datum_in_cloud(datum: Datum, model: Model, cloud: CloudPoints, moves: Mapping[str, Move]) -> DatumEquations:
+    """Offsets of one datum, by the method for its feature; errors as `measure_datums_in_cloud`."""
     if datum.feature == "fit":
         if datum.component not in moves:
             raise DatumNotMeasuredError(f"datum {datum.label}: {datum.component!r} could not be measured as a whole")

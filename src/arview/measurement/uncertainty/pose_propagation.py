@@ -13,7 +13,7 @@ from arview.core.parallel import pool
 from arview.errors import InputError
 from arview.geometry import Array, apply
 from arview.measurement.datums.alignment import Alignment
-from arview.measurement.datums.equations import point_from_move
+from arview.measurement.datums.equations import DatumEquations, point_from_move
 from arview.reconstruction import PosedPhoto, SparseModel
 from arview.rendering import ZBufferRenderer
 
@@ -134,7 +134,7 @@ class PosePropagation:
         """(7,6M) derivative of a datum frame by the poses."""
         frame = np.zeros((7, len(self.covariance)))
         for one, gain in zip(alignment.equations, alignment.gains, strict=True):
-            frame += gain @ self.offsets(one.rows, one.points, one.feature == "fit")
+            frame += gain @ self.offsets(one)
         return frame
 
     def relative_to(self, alignment: Alignment) -> PosePropagation:
@@ -156,10 +156,10 @@ class PosePropagation:
         unit = np.array([float(np.ptp(points, axis=0).max()) or 1.0] * 3 + [1.0] * 3)
         return np.linalg.lstsq(rows / unit, moved.reshape(len(rows), -1), rcond=1e-3)[0] / unit[:, None]
 
-    def offsets(self, rows: Array, points: Array, is_fit: bool = False) -> Array:
+    def offsets(self, one: DatumEquations) -> Array:
         """(N,6M) derivative of a datum's offsets by the poses, with the change of scale removed."""
-        origin = self.alignment.origin_in_model
-        if is_fit:
+        origin, rows, points = self.alignment.origin_in_model, one.rows, one.points
+        if one.feature == "fit":
             center = points[0]
             arms = rows[:, :3] - np.cross(center, rows[:, 3:6])
             name = min(self.model.components, key=lambda c: float(np.linalg.norm(c.centroid_in_model - center)))
