@@ -25,17 +25,14 @@ from arview.measurement.datums.equations import DatumEquations, point_from_move
 from arview.measurement.features import STATE, MeasuredFeature, component_feature, feature_of, joint_state
 from arview.measurement.measurand import measurand_of
 from arview.measurement.options import ComponentMeasurement, combined_of
+from arview.measurement.uncertainty.budget import K
 from arview.measurement.uncertainty.decision import decide, worst
 from arview.measurement.uncertainty.pose_propagation import PosePropagation
-from arview.measurement.zones import K, Zone, with_uncertainty
+from arview.measurement.zones import Zone, with_uncertainty
 
-WITH_LIMITS = ("size", "distance", "gap", "flush")
 ORIENTATIONS = ("perpendicularity", "parallelism", "angularity")
-ALONG_AXIS = ("hole", "pin", "cylinder")
 FORM_NOTE = "the form of the surface between its edges is not in the value"
 MEANS_NOTE = "of the means of {count} cells of the surface: shorter waves are not in the value"
-
-
 OF_WHOLE_NOTE = "{component} as a whole was measured: its shape is taken to be that of the CAD"
 MeasureFeature = Callable[[Datum], tuple[Sequence[DatumEquations], str]]
 """Measures the offsets of a feature, by one or two methods, and has a note about it or an empty text."""
@@ -110,12 +107,10 @@ def measure_characteristics(
         except InputError as error:
             features[name] = str(error).removeprefix("datum ")
     decisions = _Decisions(part, features, frames, guard)
-    found: list[CharacteristicResult] = []
-    # A bonus needs the sizes first.
-    for one in sorted(part.characteristics, key=lambda one: one.kind not in WITH_LIMITS):
-        found.append(decisions.result(one))
-    order = {one.name: index for index, one in enumerate(part.characteristics)}
-    return tuple(sorted(found, key=lambda one: order[one.name]))
+    # A bonus needs the sizes first, which have limits and no zone.
+    ordered = sorted(part.characteristics, key=lambda one: one.tolerance_mm is not None)
+    found = {one.name: decisions.result(one) for one in ordered}
+    return tuple(found[one.name] for one in part.characteristics)
 
 
 def _component(
@@ -164,7 +159,8 @@ class _Decisions:
             x, y, z = (float(v) for v in np.mean([feature.center for feature in features], axis=0).tolist())
             noted = tuple(dict.fromkeys(feature.note for feature in features if feature.note))
             empty = replace(empty, point_mm=(x, y, z), notes=noted)
-            return self._limited(one, features, empty) if one.kind in WITH_LIMITS else self._zone(one, features, empty)
+            measure = self._limited if one.tolerance_mm is None else self._zone
+            return measure(one, features, empty)
         except InputError as error:
             return replace(empty, reason=str(error))
 

@@ -8,7 +8,6 @@ motion, is the diameter or width of the smallest zone. Up to the exact lengths a
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 
@@ -17,13 +16,14 @@ from scipy.optimize import linprog
 
 from arview.core.fits import covariance_root
 from arview.geometry import Array
+from arview.measurement.uncertainty.budget import PROBABILITY
 
-PROBABILITY = 0.95
-K = 2.0
 DRAWS, DRAWS_OF_FREE = 4000, 300
 """Monte Carlo draws, and those where each needs a linear programme."""
 SIDES = 48
 """Sides of the polygon that stands for a circle while a free zone is moved."""
+TOLERANCE = 0.05
+"""Share of a motion by which a zone may change that is said not to depend on it."""
 RECENTRINGS = 3
 """Further programmes whose polygons are turned towards the displacements that the one before left."""
 
@@ -45,14 +45,18 @@ class Zone:
 
     def size_mm(self, state: Array) -> float:
         """Diameter or width of the smallest zone that holds a state (S,)."""
-        at = self.displacements @ state
+        return float(self.sizes_mm(state[None])[0])
+
+    def sizes_mm(self, states: Array) -> Array:
+        """The same (N,) for each of some states (N,S)."""
+        at = np.einsum("pds,ns->npd", self.displacements, states, optimize=True)
         if self.motions.shape[2]:
-            at = self._moved(at)
-        return 2.0 * float(np.linalg.norm(at, axis=1).max())
+            at = np.stack([self._moved(one) for one in at])
+        return np.asarray(2.0 * np.linalg.norm(at, axis=2).max(axis=1))
 
     def _moved(self, at: Array) -> Array:
         """Displacements (P,D) seen from the best place of the zone."""
-        sides, best = _sides(at.shape[1]), at
+        sides, discs, best = _sides(at.shape[1]), self._discs(), at
         for _ in range(1 + RECENTRINGS * (at.shape[1] > 1)):
             own = best / np.maximum(np.linalg.norm(best, axis=1, keepdims=True), 1e-12)
             rows = np.concatenate([np.tile(sides, (len(at), 1, 1)), own[:, None]], axis=1)  # (P,sides,D)
@@ -61,13 +65,12 @@ class Zone:
             unit = np.maximum(np.abs(by_motion).max(axis=0), 1e-12)
             cost = np.zeros(by_motion.shape[1] + 1)
             cost[-1] = 1.0
-            discs = self._discs() / unit
             found = linprog(
                 cost,
                 A_ub=np.concatenate(
                     [
                         np.concatenate([-by_motion / unit, -np.ones((len(values), 1))], axis=1),
-                        np.concatenate([discs, np.zeros((len(discs), 1))], axis=1),
+                        np.concatenate([discs / unit, np.zeros((len(discs), 1))], axis=1),
                     ]
                 ),
                 b_ub=np.concatenate([-values, np.ones(len(discs))]),
@@ -93,9 +96,9 @@ class Zone:
             first += 1
         return rows
 
-    def depends_on(self, directions: Array, tolerance: float = 0.05) -> bool:
+    def depends_on(self, directions: Array) -> bool:
         """Whether states (N,S) of about a millimetre change the zone's size by more than a share of that."""
-        return any(self.size_mm(direction) > 2.0 * tolerance for direction in directions)
+        return bool((self.sizes_mm(directions) > 2.0 * TOLERANCE).any()) if len(directions) else False
 
 
 @cache
@@ -119,23 +122,11 @@ def with_uncertainty(zone: Zone, state: Array, covariance: Array) -> tuple[float
     U is what 95 % of draws of the error do not exceed. A size that pure noise stays below with the same probability is
     compatible with zero: there U is at least the size, as in `uncertainty.budget.length_of`.
     """
-    is_free = zone.motions.shape[2] > 0
     rng = np.random.default_rng(0)
-    draws = DRAWS_OF_FREE if is_free else DRAWS
+    draws = DRAWS_OF_FREE if zone.motions.shape[2] else DRAWS
     errors = rng.standard_normal((draws, len(state))) @ covariance_root(covariance).T
-    sizes = _sizes(zone) if not is_free else lambda states: np.array([zone.size_mm(one) for one in states])
     value = zone.size_mm(state)
-    uncertainty = float(np.quantile(np.abs(sizes(state + errors) - value), PROBABILITY))
-    if value <= float(np.quantile(sizes(errors), PROBABILITY)):
+    uncertainty = float(np.quantile(np.abs(zone.sizes_mm(state + errors) - value), PROBABILITY))
+    if value <= float(np.quantile(zone.sizes_mm(errors), PROBABILITY)):
         uncertainty = max(uncertainty, value)
     return value, uncertainty
-
-
-def _sizes(zone: Zone) -> Callable[[Array], Array]:
-    """Sizes (N,) of a zone that cannot move, for states (N,S)."""
-
-    def of(states: Array) -> Array:
-        at = np.einsum("pds,ns->npd", zone.displacements, states, optimize=True)
-        return np.asarray(2.0 * np.linalg.norm(at, axis=2).max(axis=1))
-
-    return of
