@@ -177,6 +177,11 @@ BAD = [
         '[datums.A]\nfeature = "hole"\ncomponent = "post_1"\npoint_mm = [0, 0, 0]\naxis = [0, 0, 1]\n',
         "diameter_mm",
     ),
+    (
+        '[features.post_1]\nfeature = "fit"\ncomponent = "post_2"\n',
+        r"\[features.post_1\] 'post_1' is the name of a component or datum",
+    ),
+    ('[features.top]\nfeature = "fit"\ncomponent = "post_2"\nlocks = ["tx"]\n', "unknown key 'locks'"),
     ('[[characteristics]]\nkind = "place"\n', 'kind = .place.: expected one of "position"'),
     ('[[characteristics]]\nkind = "position"\nof = "bore"\n', "of = 'bore': expected features or components, of base_"),
     (

@@ -141,6 +141,9 @@ def test_a_first_article_form_has_a_line_for_each(found: Inspection, tmp_path: P
     own.write_text("{{ drawing }}: {{ numbered|length }}")
     make_report(tmp_path / "inspection.json", page, None, None, template=own)
     assert page.read_text() == "4711-02 rev. C: 8"
+    own.write_text("{{ nothing() }}")
+    with pytest.raises(InputError, match=r"own\.html: cannot be used as a template: 'nothing' is undefined"):
+        make_report(tmp_path / "inspection.json", page, None, None, template=own)
     own.write_text("{% if %}")
     with pytest.raises(InputError, match=r"own\.html: cannot be used as a template"):
         make_report(tmp_path / "inspection.json", page, None, None, template=own)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -270,7 +270,7 @@ def _read_part(root: TomlTable, path: Path, unit: str | None, load: Callable[...
     view_range = replace(view_range, up=up) if view_range else None
     names = [component.name for component in cad.model.components]
     datums = _read_datums(root.table("datums"), cad.model)
-    features = _read_datums(root.table("features"), cad.model)
+    features = _read_datums(root.table("features"), cad.model, taken=[*names, *(datum.label for datum in datums)])
     characteristics = read_characteristics(root.tables("characteristics"), names, datums, features)
     rework = _ReworkTables(read_rework_kinds(root.table("rework")), [*names, *(d.feature_name for d in datums)])
     defaults = _read_settings(root.table("defaults"), "", cad.model, ComponentSettings(""), rework)
@@ -433,7 +433,8 @@ def _read_symmetry(table: TomlTable, default_through: Vector) -> Symmetry:
     return Symmetry(axis, through, order)
 
 
-def _read_datums(tables: TomlTable, model: Model) -> tuple[Datum, ...]:
+def _read_datums(tables: TomlTable, model: Model, taken: Sequence[str] | None = None) -> tuple[Datum, ...]:
+    """Datums; or features, which lock nothing, with names that no component or datum has (``taken``)."""
     datums, names = [], [component.name for component in model.components]
     for label in tables.content:
         table = tables.table(label)
@@ -448,7 +449,9 @@ def _read_datums(tables: TomlTable, model: Model) -> tuple[Datum, ...]:
             direction = table.direction("normal" if feature in ("plane", "point") else "axis")
         if feature in ("hole", "pin", "cylinder"):
             diameter_mm = table.positive("diameter_mm", required=True)
-        locks = table.choices("locks", DOF_NAMES)
+        locks = table.choices("locks", DOF_NAMES) if taken is None else DOF_NAMES
+        if label in (taken or ()):
+            raise InputError(f"{table.path}: [{table.name}] {label!r} is the name of a component or datum")
         table.finish()
         datums.append(Datum(label, feature, component, point, direction, diameter_mm, locks))
     tables.finish()

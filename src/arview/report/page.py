@@ -133,11 +133,6 @@ def render(context: dict[str, Any], for_print: bool, template_path: Path | None 
 
     here = resources.files("arview.report")
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.ChainableUndefined, trim_blocks=True)
-    try:
-        source = (template_path or here / "template.html").read_text(encoding="utf-8")
-        template = environment.from_string(source)
-    except (OSError, ValueError, jinja2.TemplateError) as error:
-        raise InputError(f"{template_path}: cannot be used as a template: {error}") from error
     faces = [
         f"@font-face {{ font-family: {family}; font-weight: {weight}; font-style: normal; "
         f'src: url({_data_url(font(name), "font/woff2")}) format("woff2"); }}'
@@ -146,16 +141,22 @@ def render(context: dict[str, Any], for_print: bool, template_path: Path | None 
     gradient = f".gradient {{ background: linear-gradient(to right, {_GRADIENT}); }}"
     css = "\n".join(["", *faces, (here / "report.css").read_text(encoding="utf-8"), gradient, ""])
     scripts = three_js(), (here / "viewer.js").read_text(encoding="utf-8"), _PRINT_SCRIPT
-    return template.render(
-        context,
-        for_print=for_print,
-        policy=None if for_print else _policy(css, scripts),
-        css=Markup(css),
-        hex={verdict.value: color for verdict, color in charts.VERDICT_HEX.items()},
-        three=Markup(scripts[0]),
-        viewer=Markup(scripts[1]),
-        print_script=Markup(scripts[2]),
-    )
+    try:
+        template = environment.from_string((template_path or here / "template.html").read_text(encoding="utf-8"))
+        return template.render(
+            context,
+            for_print=for_print,
+            policy=None if for_print else _policy(css, scripts),
+            css=Markup(css),
+            hex={verdict.value: color for verdict, color in charts.VERDICT_HEX.items()},
+            three=Markup(scripts[0]),
+            viewer=Markup(scripts[1]),
+            print_script=Markup(scripts[2]),
+        )
+    except (OSError, ValueError, TypeError, jinja2.TemplateError) as error:
+        if template_path is None:
+            raise
+        raise InputError(f"{template_path}: cannot be used as a template: {error}") from error
 
 
 def _policy(css: str, scripts: Sequence[str]) -> str:
