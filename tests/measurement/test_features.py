@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from arview.cad.part import Characteristic, Datum
-from arview.geometry import exp_so3, invert, rigid
 from arview.inspection import (
     CharacteristicResult,
     Inspection,
@@ -18,17 +17,14 @@ from arview.inspection import (
     overall_verdict,
     save_inspection,
 )
-from arview.measurement.folder import MetricReconstruction
 from arview.measurement.options import MeasureOptions
 from arview.measurement.run import measure
-from arview.reconstruction.scale.types import Consistency, ScaleEvidence, ScaleResult
-from arview.reconstruction.types import PosedPhoto, SparseModel
 from helpers.feature_scene import CAMERA, FeatureScene, feature_scene
-from helpers.photo_scene import photograph, ring, write_photos
+from helpers.photo_scene import photograph, ring
+from helpers.placed_photos import placed
 
 pytestmark = pytest.mark.slow  # two dozen features measured in sixteen photos
 
-ROUGH_FROM_TRUE = rigid(exp_so3(np.deg2rad([0.03, -0.02, 0.05])), [0.15, -0.2, 0.1])
 EVERYTHING = ("A", "B", "C")
 
 
@@ -66,20 +62,8 @@ def scene() -> FeatureScene:
 def inspection(scene: FeatureScene, tmp_path_factory: pytest.TempPathFactory) -> Inspection:
     poses = ring(16, distance_mm=330.0)
     pictures = [photograph(scene.built, pose, CAMERA, seed=4, is_linear=True) for pose in poses]
-    photos = tuple(
-        PosedPhoto(path.name, path, CAMERA, pose @ invert(ROUGH_FROM_TRUE))
-        for path, pose in zip(write_photos(tmp_path_factory.mktemp("photos"), pictures), poses, strict=True)
-    )
-    none = np.zeros(0)
-    covariance = np.diag(np.tile([3e-6] * 3 + [2e-3] * 3, len(photos))) ** 2
-    sparse = SparseModel(
-        photos, np.zeros((0, 3)), np.zeros((0, 3), np.uint8), none, none.astype(np.int32), none.astype(np.int32),
-        np.zeros((0, 2)), pose_covariance=covariance,
-    )  # fmt: skip
-    scale = ScaleResult(
-        1.0, 5e-5, np.eye(4), None, (ScaleEvidence("board", 1.0, 5e-5, ""),), (), "", Consistency(True, "")
-    )
-    return measure(MetricReconstruction(sparse, scale, None), scene.part, MeasureOptions(methods=("sweep", "edges")))
+    reconstruction = placed(tmp_path_factory.mktemp("photos"), pictures, poses, CAMERA)
+    return measure(reconstruction, scene.part, MeasureOptions(methods=("sweep", "edges")))
 
 
 def result(inspection: Inspection, name: str) -> CharacteristicResult:

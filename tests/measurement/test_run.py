@@ -15,7 +15,7 @@ from arview.cad.part import ComponentSettings, Datum, Part
 from arview.cad.part_file import load_part
 from arview.cli import ExitCode, main
 from arview.errors import InputError
-from arview.geometry import Array, apply, exp_so3, invert, rigid
+from arview.geometry import Array, apply
 from arview.inspection import Inspection, Verdict, load_inspection, save_inspection
 from arview.inspection.summary import overall_verdict
 from arview.measurement import run
@@ -25,14 +25,12 @@ from arview.measurement.folder import MetricReconstruction, read_folder
 from arview.measurement.options import MeasureOptions
 from arview.measurement.run import measure
 from arview.measurement.uncertainty.budget import UncertaintyOptions
-from arview.reconstruction.scale.types import Consistency, ScaleEvidence, ScaleResult
-from arview.reconstruction.types import PosedPhoto, SparseModel
+from arview.reconstruction.scale.types import Consistency, ScaleResult
 from helpers import photo_scene
 from helpers.cad_files import box, obj_text
-from helpers.photo_scene import CAMERA, photograph, ring, write_photos
+from helpers.photo_scene import CAMERA, photograph, ring
+from helpers.placed_photos import ROUGH_FROM_TRUE, placed
 from helpers.plate_scene import TRUTH, as_built, nominal, part
-
-ROUGH_FROM_TRUE = rigid(exp_so3(np.deg2rad([0.03, -0.02, 0.05])), [0.15, -0.2, 0.1])
 
 
 @pytest.fixture(scope="module")
@@ -43,20 +41,7 @@ def reconstruction(tmp_path_factory: pytest.TempPathFactory) -> MetricReconstruc
 
 def _photographed(folder: Path) -> MetricReconstruction:
     built, poses = as_built(), ring(12, distance_mm=420.0)
-    paths = write_photos(folder, [photograph(built, pose, seed=4) for pose in poses])
-    photos = tuple(
-        PosedPhoto(path.name, path, CAMERA, pose @ invert(ROUGH_FROM_TRUE))
-        for path, pose in zip(paths, poses, strict=True)
-    )
-    none = np.zeros(0)
-    covariance = np.diag(np.tile([3e-6] * 3 + [2e-3] * 3, 12)) ** 2
-    sparse = SparseModel(
-        photos, np.zeros((0, 3)), np.zeros((0, 3), np.uint8), none, none.astype(np.int32), none.astype(np.int32),
-        np.zeros((0, 2)), pose_covariance=covariance,
-    )  # fmt: skip
-    evidence = (ScaleEvidence("board", 1.0, 5e-5, "a board"),)
-    scale = ScaleResult(1.0, 5e-5, np.eye(4), None, evidence, (), "", Consistency(True, "checked"))
-    return MetricReconstruction(sparse, scale, None)
+    return placed(folder, [photograph(built, pose, seed=4) for pose in poses], poses, CAMERA)
 
 
 @pytest.fixture(scope="module")

@@ -10,23 +10,17 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from arview.geometry import Array, exp_so3, invert, rigid
+from arview.geometry import Array
 from arview.inspection import Inspection, Verdict
-from arview.measurement.folder import MetricReconstruction
 from arview.measurement.options import MeasureOptions
 from arview.measurement.run import measure
-from arview.reconstruction.scale.types import Consistency, ScaleEvidence, ScaleResult
-from arview.reconstruction.types import PosedPhoto, SparseModel
 from helpers import photo_scene
 from helpers.feature_scene import CAMERA, FeatureScene, feature_scene
-from helpers.photo_scene import photograph, ring, write_photos
+from helpers.photo_scene import photograph, ring
+from helpers.placed_photos import placed
 from rows import ResultRow, watched
 
 PHOTOS, SETS = 24, 5
-ROUGH_FROM_TRUE = rigid(exp_so3(np.deg2rad([0.03, -0.02, 0.05])), [0.15, -0.2, 0.1])
-"""Error of the frame in which the photos are placed."""
-POSE_STD = (3e-6, 2e-3)
-"""Standard uncertainties of the photos' poses that are declared, rad and mm; the poses are exact."""
 TARGETS = {"position": (0.025, 0.08), "size": (0.02, 0.06), "gap": (0.03, 0.09), "flush": (0.03, 0.09)}
 """Median and 95th percentile of the errors that must be reached, mm."""
 
@@ -75,21 +69,8 @@ def measured(scene: FeatureScene) -> Inspection:
             pictures = [photograph(scene.built, pose, CAMERA, seed=4, is_linear=True) for pose in poses]
         finally:
             photo_scene.PAINT = None
-        photos = tuple(
-            PosedPhoto(path.name, path, CAMERA, pose @ invert(ROUGH_FROM_TRUE))
-            for path, pose in zip(write_photos(Path(folder), pictures), poses, strict=True)
-        )
-        none = np.zeros(0)
-        covariance = np.diag(np.tile(np.repeat(POSE_STD, 3), PHOTOS)) ** 2
-        sparse = SparseModel(
-            photos, np.zeros((0, 3)), np.zeros((0, 3), np.uint8), none, none.astype(np.int32), none.astype(np.int32),
-            np.zeros((0, 2)), pose_covariance=covariance,
-        )  # fmt: skip
-        evidence = (ScaleEvidence("board", 1.0, 5e-5, "a board"),)
-        scale = ScaleResult(1.0, 5e-5, np.eye(4), None, evidence, (), "", Consistency(True, "exact"))
-        return measure(
-            MetricReconstruction(sparse, scale, None), scene.part, MeasureOptions(methods=("sweep", "edges"))
-        )
+        reconstruction = placed(Path(folder), pictures, poses, CAMERA)
+        return measure(reconstruction, scene.part, MeasureOptions(methods=("sweep", "edges")))
 
 
 def _steel(points: Array) -> Array:
