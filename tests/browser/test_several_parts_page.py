@@ -17,7 +17,7 @@ from arview.pose import ComponentPresence, Identity, Pose, Presence, TrackingSta
 from arview.station.live.stream.subjects import Subjects
 from arview.video import Image, VideoSink
 from helpers import live_browser, two_specimens
-from helpers.live_client import Running, running
+from helpers.live_client import Running, running, wait
 from helpers.live_sample import INSPECTION, loader, options
 from helpers.page import WATCH, opened, until
 
@@ -159,7 +159,8 @@ def test_each_part_has_its_ghost_its_labels_and_its_button(
         page.wait_for_timeout(2500)
         page.keyboard.press("r")
         until(page, "document.querySelector('#record').getAttribute('aria-pressed') === 'false'")
-    (path,) = tmp_path.glob("live_*.jsonl")
+    # The poses are closed after the film.
+    (path,) = wait(lambda: list(tmp_path.glob("live_*.jsonl")))
     lines = [json.loads(line) for line in path.read_text().splitlines()]
     assert len(lines) >= 4 and [one["instance"] for one in lines] == [*NAMES] * (len(lines) // 2)
     assert path.with_suffix(".mp4").stat().st_size > 10_000
