@@ -7,7 +7,6 @@ A twist is (6,) = (rotation vector in rad, translation); perturbations are appli
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -120,11 +119,6 @@ def are_near(a: Array, b: Array, reach: float, angle_deg: float) -> bool:
     return cosine > math.cos(math.radians(angle_deg))
 
 
-def turned(b_from_a: Array, turns: Iterable[Array]) -> list[Array]:
-    """A pose (4,4) after each of some turns (3,3) of ``a`` about its origin."""
-    return [rigid(b_from_a[:3, :3] @ turn, b_from_a[:3, 3]) for turn in turns]
-
-
 def turn_ball(reach_deg: float, step_deg: float) -> Array:
     """(R,3,3) rotations on a body-centred grid of rotation vectors inside a ball, none at all among them."""
     steps = int(np.ceil(reach_deg / step_deg))
@@ -177,6 +171,12 @@ def direction_from(cam_from_model: Array, center_in_model: Array) -> Array:
     """Unit vector (3,), in the model frame, from a part's centre (3,) towards the camera at a pose (4,4)."""
     offset = -cam_from_model[:3, :3].T @ cam_from_model[:3, 3] - center_in_model
     return np.asarray(offset / np.linalg.norm(offset), dtype=np.float64)
+
+
+def from_segment(arms: Array, half: Array) -> Array:
+    """The arms (…,D) from the nearest point of a line between ``-half`` and ``half`` (D,), which may be a point."""
+    along = np.clip(arms @ half / max(float(half @ half), 1e-30), -1.0, 1.0)
+    return np.asarray(arms - along[..., None] * half)
 
 
 def check_rigid(matrix: ArrayLike, name: str) -> Array:

@@ -171,7 +171,7 @@ BAD = [
     ("[components.post_1]\nsymmetry = { axis = [0, 0, 1], order = 1 }\n", 'at least 2, or "continuous"'),
     ("[components.post_1]\nsymmetry = { axis = [0, 0], order = 2 }\n", r"three numbers \[x, y, z\]"),
     ("[symmetry]\naxis = [0, 0, 1]\n", r"expected tables \[\[symmetry\]\]"),
-    ('[datums.A]\nfeature = "slot"\n', 'expected one of "plane", "hole", "pin"'),
+    ('[datums.A]\nfeature = "cone"\n', 'expected one of "plane", "hole", "pin"'),
     ('[datums.A]\nfeature = "plane"\ncomponent = "base"\n', "no component 'base' in the CAD"),
     (
         '[datums.A]\nfeature = "hole"\ncomponent = "post_1"\npoint_mm = [0, 0, 0]\naxis = [0, 0, 1]\n',
@@ -186,7 +186,7 @@ BAD = [
     ('[[characteristics]]\nkind = "position"\nof = "bore"\n', "of = 'bore': expected features or components, of base_"),
     (
         '[[characteristics]]\nkind = "size"\nof = "post_1"\nmax_mm = 3\n',
-        r"of = \['post_1'\]: expected a round feature",
+        r"of = \['post_1'\]: expected a hole, pin, cylinder or slot",
     ),
     ('[[characteristics]]\nkind = "gap"\nof = ["post_1", "post_2"]\nmin_mm = 3\n', "expected flat faces"),
     ('[[characteristics]]\nkind = "distance"\nof = "post_1"\nmin_mm = 3\n', "expected two names"),

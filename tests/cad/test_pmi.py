@@ -187,7 +187,7 @@ def test_a_part_file_from_a_plate_in_an_assembly(plate: Path, tmp_path: Path) ->
     assert set(found) == {"size", "distance", "flatness", "perpendicularity", "parallelism"}
     assert found["size"].limits_mm == pytest.approx((11.9, 12.2)) and found["size"].of == (hole.label,)
     assert found["distance"].limits_mm == pytest.approx((9.95, 10.05)) and "A" in found["distance"].of
-    assert found["perpendicularity"].is_at_maximum and found["perpendicularity"].datums == ("A",)
+    assert found["perpendicularity"].material == "maximum" and found["perpendicularity"].datums == ("A",)
     assert found["parallelism"].tolerance_mm == pytest.approx(0.15)
     assert all(one.source.startswith("PMI of plate.stp: ") for one in part.characteristics)
     assert part.component_settings("plate").role == "base" and part.component_settings("shim").role == "inspect"

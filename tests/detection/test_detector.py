@@ -12,6 +12,7 @@ import pytest
 from arview.cad.model import Model, make_model
 from arview.cad.view_range import ViewRange
 from arview.detection import Detector, DetectorOptions
+from arview.detection.disambiguation import turned
 from arview.detection.features.image_pyramid import ImagePyramid
 from arview.detection.search.global_search import (
     GRADIENTS_ONLY,
@@ -29,7 +30,7 @@ from arview.detection.search.local_search import PREVIOUS_WEIGHT
 from arview.detection.search.template_bank import DOMAIN_DIRECTION, in_fundamental_domain
 from arview.detection.symmetry import edge_margin, find_rotational_symmetries
 from arview.errors import InputError
-from arview.geometry import apply, are_near, exp_so3, rigid, turned
+from arview.geometry import apply, are_near, exp_so3, rigid
 from arview.guideviews import GuideViewOptions, make_guide_views
 from arview.guideviews.sphere import icosphere_directions
 from arview.pose import TrackingState

@@ -35,8 +35,8 @@ class FeatureScene:
     true_mm: dict[str, float] = field(default_factory=dict)
 
 
-def cell(middle: Array, offset: Array, radius_mm: float) -> tuple[Array, list[tuple[int, int, int]]]:
-    """A square of plate about ``middle`` with a hole: vertices, and the triangles of its top, bottom and bore."""
+def cell(middle: Array, offset: Array, radius_mm: float, half_mm: Array) -> tuple[Array, list[tuple[int, int, int]]]:
+    """A square of plate about ``middle`` with a hole, or a slot of some half length (2,): vertices and triangles."""
     half = 0.5 * CELL_MM
     corners = np.arctan2([half, half, -half, -half], [half, -half, -half, half])
     angle = np.sort(np.concatenate([np.arange(SIDES) * 2 * np.pi / SIDES - np.pi + 0.01, corners]))
@@ -44,6 +44,8 @@ def cell(middle: Array, offset: Array, radius_mm: float) -> tuple[Array, list[tu
     reach = half / np.abs(direction).max(axis=1)
     n = len(angle)
     inner, outer = middle + offset + radius_mm * direction, middle + reach[:, None] * direction
+    if half_mm.any():
+        inner = inner + np.sign(direction @ half_mm)[:, None] * half_mm
     vertices = np.concatenate([
         np.column_stack([ring, np.full(n, z)]) for z in (0.0, -THICK_MM) for ring in (inner, outer)
     ])  # fmt: skip
@@ -59,14 +61,15 @@ def cell(middle: Array, offset: Array, radius_mm: float) -> tuple[Array, list[tu
     return vertices, faces
 
 
-def plate(columns: int, rows: int, radii_mm: Array, offsets: Array) -> Component:
-    """A plate of cells, each with a hole."""
+def plate(columns: int, rows: int, radii_mm: Array, offsets: Array, halves_mm: Array | None = None) -> Component:
+    """A plate of cells, each with a hole, or a slot where its half length (2,) is given."""
+    halves_mm = np.zeros((columns * rows, 2)) if halves_mm is None else halves_mm
     size = np.array([columns, rows]) * CELL_MM
     parts: list[Array] = []
     faces: list[tuple[int, int, int]] = []
     for index in range(columns * rows):
         middle = (np.array([index % columns, index // columns]) + 0.5) * CELL_MM - 0.5 * size
-        vertices, own = cell(middle, offsets[index], radii_mm[index])
+        vertices, own = cell(middle, offsets[index], radii_mm[index], halves_mm[index])
         before = sum(len(part) for part in parts)
         faces += [(a + before, b + before, c + before) for a, b, c in own]
         parts.append(vertices)
@@ -198,6 +201,57 @@ def feature_scene(seed: int = 0, columns: int = 5, rows: int = 4) -> FeatureScen
         features=tuple(features), characteristics=tuple(characteristics),
     )  # fmt: skip
     return FeatureScene(part, make_model("built", tuple(built)), true_mm)
+
+
+def slot_scene() -> FeatureScene:
+    """A plate with three holes and two slots, of which one is off by 0.25 mm, turned by 0.5° and too wide by 0.1 mm.
+
+    Its datum A is of three targets; further characteristics are of unequal zones and of least material.
+    """
+    middles = np.array([(x, y) for y in (-25.0, 25.0) for x in (-75.0, -25.0, 25.0, 75.0)])
+    radii, halves = np.full(8, 6.0), np.zeros((8, 2))
+    radii[[1, 6]], halves[1], halves[6] = (4.0, 5.0), (9.0, 0.0), (0.0, 7.0)
+    errors, built_radii, built_halves = np.zeros((8, 2)), radii.copy(), halves.copy()
+    errors[1], errors[5] = (0.2, -0.15), (0.1, 0.05)
+    built_radii[1] += 0.05
+    built_radii[5] -= 0.04
+    built_halves[1] = 9.0 * np.array([np.cos(np.deg2rad(0.5)), np.sin(np.deg2rad(0.5))])
+    nominal, built = plate(4, 2, radii, np.zeros((8, 2)), halves), plate(4, 2, built_radii, errors, built_halves)
+    targets = ((-90.0, 40.0, 0.0), (90.0, 40.0, 0.0), (0.0, -40.0, 0.0))
+    datums = (
+        Datum("A", "plane", "plate", (-55.0, -25.0, 0.0), UP, targets_in_model=targets),
+        Datum("B", "hole", "plate", (*middles[0].tolist(), 0.0), UP, 12.0),
+        Datum("C", "hole", "plate", (*middles[3].tolist(), 0.0), UP, 12.0),
+    )
+    features = (
+        Datum("slot", "slot", "plate", (*middles[1].tolist(), 0.0), UP, 8.0),
+        Datum("upright", "slot", "plate", (*middles[6].tolist(), 0.0), UP, 10.0),
+        Datum("hole", "hole", "plate", (*middles[5].tolist(), 0.0), UP, 12.0),
+        Datum("top", "plane", "plate", (0.0, 0.0, 0.0), UP),
+    )
+    x, y, everything = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), ("A", "B", "C")
+    characteristics = (
+        Characteristic("width", "size", ("slot",), limits_mm=(7.9, 8.15)),
+        Characteristic("across", "position", ("slot",), 0.3, direction_in_model=y, datums=everything),
+        Characteristic("along", "position", ("slot",), 0.5, direction_in_model=x, datums=everything),
+        Characteristic("upright width", "size", ("upright",), limits_mm=(9.9, 10.1)),
+        Characteristic("upright place", "position", ("upright",), 0.2, direction_in_model=x, datums=everything),
+        Characteristic("hole size", "size", ("hole",), limits_mm=(11.8, 12.1)),
+        Characteristic("least", "position", ("hole",), 0.3, zone="diameter", datums=everything, material="least"),
+        Characteristic("unequal", "position", ("slot",), 0.5, direction_in_model=x, datums=everything, offset_mm=0.2),
+        Characteristic("raised", "profile", ("top",), 0.2, datums=everything, offset_mm=0.15),
+    )  # fmt: skip
+    turn = float(built_halves[1][1])
+    true_mm = {
+        "width": 8.1, "across": 2.0 * (0.15 + turn), "along": 2.0 * (0.2 + 9.0 - float(built_halves[1][0])),
+        "upright width": 10.0, "upright place": 0.0, "hole size": 11.92, "least": 2.0 * float(np.hypot(0.1, 0.05)),
+        "unequal": 0.0, "raised": 0.3,
+    }  # fmt: skip
+    part = Part(
+        "slots", Path("part.toml"), Path("slots.step"), make_model("slots", (nominal,)),
+        (ComponentSettings("plate", "base"),), datums=datums, features=features, characteristics=characteristics,
+    )  # fmt: skip
+    return FeatureScene(part, make_model("built", (built,)), true_mm)
 
 
 def flush_of(step_mm: float, tilt_deg: float, height_mm: float) -> float:

@@ -19,7 +19,7 @@ from arview.inspection import (
 )
 from arview.measurement.options import MeasureOptions
 from arview.measurement.run import measure
-from helpers.feature_scene import CAMERA, FeatureScene, feature_scene
+from helpers.feature_scene import CAMERA, FeatureScene, feature_scene, slot_scene
 from helpers.photo_scene import photograph, ring
 from helpers.placed_photos import placed
 
@@ -36,7 +36,7 @@ def more(scene: FeatureScene) -> tuple[Characteristic, ...]:
     return (
         Characteristic("pattern", "position", tuple(holes), 1.0, zone="diameter", datums=EVERYTHING),
         Characteristic("pattern that floats", "position", tuple(holes), 1.0, zone="diameter", datums=("A",)),
-        Characteristic("bonus", "position", hole.of, 0.3, zone="diameter", datums=EVERYTHING, is_at_maximum=True),
+        Characteristic("bonus", "position", hole.of, 0.3, zone="diameter", datums=EVERYTHING, material="maximum"),
         Characteristic("tilt of a block", "perpendicularity", ("left_5",), 0.3, zone="diameter", datums=("A",)),
         Characteristic("tilt of a rim", "perpendicularity", hole.of, 0.1, zone="diameter", datums=("A",)),
         Characteristic("flatness", "flatness", ("A",), 0.2),
@@ -60,10 +60,14 @@ def scene() -> FeatureScene:
 
 @pytest.fixture(scope="module")
 def inspection(scene: FeatureScene, tmp_path_factory: pytest.TempPathFactory) -> Inspection:
+    return measured(scene, tmp_path_factory.mktemp("photos"))
+
+
+def measured(scene: FeatureScene, folder: Path) -> Inspection:
+    """The inspection of what was built, by photos from 16 places."""
     poses = ring(16, distance_mm=330.0)
     pictures = [photograph(scene.built, pose, CAMERA, seed=4, is_linear=True) for pose in poses]
-    reconstruction = placed(tmp_path_factory.mktemp("photos"), pictures, poses, CAMERA)
-    return measure(reconstruction, scene.part, MeasureOptions(methods=("sweep", "edges")))
+    return measure(placed(folder, pictures, poses, CAMERA), scene.part, MeasureOptions(methods=("sweep", "edges")))
 
 
 def result(inspection: Inspection, name: str) -> CharacteristicResult:
@@ -146,3 +150,20 @@ def test_form_of_a_flat_plate(inspection: Inspection) -> None:
 def test_the_file_holds_them(inspection: Inspection, tmp_path: Path) -> None:
     save_inspection(inspection, tmp_path / "inspection.json")
     assert load_inspection(tmp_path / "inspection.json") == inspection
+
+
+def test_slots_targets_least_material_and_unequal_zones(tmp_path: Path) -> None:
+    """A pixel is 0.18 mm; the frame is of three targets, and each value is within U and 60 µm of the truth."""
+    scene = slot_scene()
+    found = {one.name: one for one in measured(scene, tmp_path).characteristics}
+    assert set(found) == set(scene.true_mm)
+    for name, true_mm in scene.true_mm.items():
+        one = found[name]
+        assert one.value_mm is not None and one.uncertainty_mm is not None, one
+        assert abs(one.value_mm - true_mm) <= min(one.uncertainty_mm, 0.06), (one, true_mm)
+    least = found["least"]
+    assert least.bonus_mm == pytest.approx(12.1 - (found["hole size"].value_mm or 0.0)) and least.bonus_mm > 0.1
+    assert [found[name].verdict for name in ("across", "along", "raised", "upright width")] == [
+        Verdict.FAIL, Verdict.PASS, Verdict.FAIL, Verdict.PASS
+    ]  # fmt: skip
+    assert any("+0.15 mm off nominal" in note for note in found["raised"].notes)

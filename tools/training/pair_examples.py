@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 
 from arview.core.atomic import replacing
 from arview.detection import Detector
+from arview.detection.disambiguation import turned
 from arview.detection.features.image_pyramid import ImagePyramid
 from arview.detection.scoring.pair_comparator import pair_crops
 from arview.detection.search.global_search import QUICK
 from arview.detection.search.hypothesis import Hypothesis
-from arview.geometry import Array, exp_so3, log_so3, rigid, turned
+from arview.geometry import Array, exp_so3, log_so3, rigid
 from arview_lab.semisynthetic.random_solids import random_near_symmetric, random_solid
 from profile_ranker_examples import REFINED_APART, REFINED_NEAR, is_near, pictures_of
 from seeded_files import missing_files

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import cast, get_args
 
-from arview.cad.part import Characteristic, CharacteristicKind, Datum, DatumFeature, ZoneShape
+from arview.cad.part import Characteristic, CharacteristicKind, Datum, DatumFeature, MaterialCondition, ZoneShape
 from arview.cad.toml_table import TomlTable
 from arview.errors import InputError
 
@@ -15,6 +15,7 @@ OF_TWO = ("distance", "gap", "flush")
 FLAT_KINDS = ("profile", "flatness", "gap", "flush")
 """Kinds that are about flat faces only."""
 ROUND: tuple[DatumFeature, ...] = ("hole", "pin", "cylinder")
+SIZED: tuple[DatumFeature, ...] = (*ROUND, "slot")
 MAXIMUM_MARK = "(M)"
 
 
@@ -56,8 +57,8 @@ def _read(table: TomlTable, targets: Mapping[str, DatumFeature], datums: Mapping
         table.fail("of", list(of), "two names" if kind in OF_TWO else "one name; only a position may be of a pattern")
     if kind in FLAT_KINDS and features != {"plane"}:
         table.fail("of", list(of), f'flat faces: {kind} is of features whose feature is "plane"')
-    if kind == "size" and not features <= set(ROUND):
-        table.fail("of", list(of), "a round feature: hole, pin or cylinder")
+    if kind == "size" and not features <= set(SIZED):
+        table.fail("of", list(of), "a hole, pin, cylinder or slot")
     of_component: ZoneShape = "sphere" if kind == "position" else "diameter"
     default: ZoneShape = "diameter" if features <= set(ROUND) else of_component if features <= {"fit"} else "width"
     zone = cast(ZoneShape, table.choice("zone", get_args(ZoneShape), default)) if kind == "position" else default
@@ -69,7 +70,12 @@ def _read(table: TomlTable, targets: Mapping[str, DatumFeature], datums: Mapping
             table.fail(
                 "datums", label, f"datums of the part, of {', '.join(datums)}; only round ones with {MAXIMUM_MARK}"
             )
-    is_at_maximum = table.flag("at_maximum_material") if kind not in (*WITH_LIMITS, *FLAT_KINDS) else False
+    material: MaterialCondition = ""
+    if kind not in (*WITH_LIMITS, *FLAT_KINDS):
+        flags = table.flag("at_maximum_material"), table.flag("at_least_material")
+        if all(flags):
+            table.fail("at_least_material", True, "maximum or least material, not both")
+        material = "maximum" if flags[0] else "least" if flags[1] else ""
     tolerance_mm = table.positive("tolerance_mm", required=True) if kind not in WITH_LIMITS else None
     low, high = (table.number("min_mm"), table.number("max_mm")) if kind in WITH_LIMITS else (None, None)
     if kind in WITH_LIMITS and (
@@ -77,6 +83,8 @@ def _read(table: TomlTable, targets: Mapping[str, DatumFeature], datums: Mapping
     ):
         table.fail("min_mm", low, "min_mm below max_mm, or one of both")
     direction = table.direction("direction") if table.known("direction") else None
+    is_flat_zone = kind == "profile" or (kind == "position" and zone == "width")
+    offset_mm = (table.number("offset_mm") if is_flat_zone else None) or 0.0
     if set(of) & set(labels):
         table.fail("of", list(of), "no feature that is one of its own datums")
     if tolerance_mm and zone == "width" and direction is None and not features <= {"plane", "point"}:
@@ -93,7 +101,8 @@ def _read(table: TomlTable, targets: Mapping[str, DatumFeature], datums: Mapping
         zone=zone,
         direction_in_model=direction,
         datums=labels,
-        is_at_maximum=is_at_maximum,
+        offset_mm=offset_mm,
+        material=material,
         datums_at_maximum=at_maximum,
         source=source,
     )
@@ -103,9 +112,9 @@ def _check_sizes(tables: Sequence[TomlTable], found: Sequence[Characteristic]) -
     """Raise InputError where maximum material has a meaning only with the limits of a size that are not there."""
     sized = {one.of[0] for one in found if one.kind == "size"}
     for table, one in zip(tables, found, strict=True):
-        needed = {*(one.of if one.is_at_maximum else ()), *one.datums_at_maximum} - sized
+        needed = {*(one.of if one.material else ()), *one.datums_at_maximum} - sized
         if needed:
             raise InputError(
-                f"{table.path}: [characteristics] {one.name!r}: maximum material needs the limits of the size of"
-                f' {", ".join(sorted(needed))}; add a characteristic of the kind "size"'
+                f"{table.path}: [characteristics] {one.name!r}: {one.material or 'maximum'} material needs"
+                f' the limits of the size of {", ".join(sorted(needed))}; add a characteristic of the kind "size"'
             )

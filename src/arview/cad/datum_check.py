@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,7 +13,7 @@ from arview.cad.model import Component
 from arview.cad.part import Datum, Part
 from arview.cad.shape.mesh_topology import edge_faces
 from arview.core.fits import fit_circle
-from arview.geometry import Array
+from arview.geometry import Array, from_segment
 
 SHARP_DEG = 25.0
 """Angle between faces from which their common edge is a rim."""
@@ -32,11 +33,19 @@ PLACE_MM = 0.2
 
 @dataclass(frozen=True)
 class RoundEdge:
-    """A round edge: centre and axis in the model, mm, and radius."""
+    """A round edge, or that of a slot, whose ends are half circles.
+
+    Attributes:
+        center_in_model: (3,) its middle, mm.
+        axis_in_model: (3,) unit.
+        radius_mm: of the circle or half circles.
+        half_in_model: (3,) from the middle to the centre of one half circle, mm; zero for a circle.
+    """
 
     center_in_model: Array
     axis_in_model: Array
     radius_mm: float
+    half_in_model: Array = field(default_factory=lambda: np.zeros(3))
 
 
 def datum_problems(part: Part) -> list[str]:
@@ -47,10 +56,11 @@ def datum_problems(part: Part) -> list[str]:
         if datum.component not in names:
             continue
         component = part.model.component(datum.component)
-        if datum.feature in ("hole", "pin", "cylinder"):
+        if datum.feature in ("hole", "pin", "cylinder", "slot"):
             if datum.component not in rims:
-                rims[datum.component] = find_rims(component)
-            text = _round_problem(datum, rims[datum.component])
+                rims[datum.component] = find_rims(component, with_slots=True)
+            same = [rim for rim in rims[datum.component] if rim.half_in_model.any() == (datum.feature == "slot")]
+            text = _round_problem(datum, same)
         elif datum.feature == "plane":
             text = _plane_problem(datum, component)
         else:
@@ -60,8 +70,8 @@ def datum_problems(part: Part) -> list[str]:
     return texts
 
 
-def find_rims(component: Component) -> list[RoundEdge]:
-    """The round edges of a component: closed loops of sharp edges whose vertices lie on a circle."""
+def find_rims(component: Component, with_slots: bool = False) -> list[RoundEdge]:
+    """The round edges of a component: closed loops of sharp edges whose vertices lie on a circle, or around a slot."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
@@ -77,7 +87,7 @@ def find_rims(component: Component) -> list[RoundEdge]:
         rim
         for loop in loops
         if len(loop) >= MIN_CORNERS and np.all(degree[loop] == 2)
-        if (rim := _fitted_rim(vertices[loop], ROUND_SHARE)) is not None
+        if (rim := _fitted_rim(vertices[loop], ROUND_SHARE, with_slots)) is not None
     ]
 
 
@@ -91,8 +101,8 @@ def _sharp_edges(vertices: Array, faces: NDArray[np.int64], sharp_deg: float) ->
     return edges.ends[(edges.face_count == 2) & (cosine < np.cos(np.deg2rad(sharp_deg)))]
 
 
-def _fitted_rim(points: Array, round_share: float) -> RoundEdge | None:
-    """The circle through points (N,3), or None when they are not on one."""
+def _fitted_rim(points: Array, round_share: float, with_slots: bool) -> RoundEdge | None:
+    """The circle, or the outline of a slot, through points (N,3); None when they are on none."""
     middle = points.mean(axis=0)
     _, sizes, axes = np.linalg.svd(points - middle)
     if sizes[1] < 1e-9:
@@ -101,9 +111,17 @@ def _fitted_rim(points: Array, round_share: float) -> RoundEdge | None:
     center, radius = fit_circle(flat)
     away = np.abs(np.hypot(*(flat - center).T) - radius)
     height = np.abs((points - middle) @ axes[2])
+    half = np.zeros(2)
+    if away.max() > round_share * radius and with_slots:
+        # The smallest rectangle around a slot lies along it.
+        box = cv2.boxPoints(cv2.minAreaRect(flat.astype(np.float32))).astype(np.float64)
+        sides = sorted((box[1] - box[0], box[2] - box[1]), key=lambda side: float(np.linalg.norm(side)))
+        radius, length = 0.5 * float(np.linalg.norm(sides[0])), float(np.linalg.norm(sides[1]))
+        center, half = box.mean(axis=0), sides[1] * (0.5 - radius / max(length, 1e-9))
+        away = np.abs(np.linalg.norm(from_segment(flat - center, half), axis=1) - radius)
     if radius <= 0 or max(away.max(), height.max()) > round_share * radius:
         return None
-    return RoundEdge(middle + center @ axes[:2], axes[2], radius)
+    return RoundEdge(middle + center @ axes[:2], axes[2], radius, half @ axes[:2])
 
 
 def _round_problem(datum: Datum, rims: list[RoundEdge]) -> str:

@@ -19,7 +19,7 @@ NamedPoint = Literal["mass", "seat", "axis", "hole"]
 """Points of a component by which its place is stated: centre of mass, middle of the surface on which it stands, foot of
 its axis, centre of its hole."""
 
-DatumFeature = Literal["plane", "hole", "pin", "cylinder", "edge", "point", "fit"]
+DatumFeature = Literal["plane", "hole", "pin", "slot", "cylinder", "edge", "point", "fit"]
 ReworkVerb = Literal["towards", "away from"]
 DOF_NAMES = ("rx", "ry", "rz", "tx", "ty", "tz")
 """Degrees of freedom: rotations about and translations along the axes of the model."""
@@ -102,9 +102,11 @@ class Datum:
         feature: its kind.
         component: name of the component that carries it.
         point_in_model: a point on it, mm; for ``fit``, the best fit of a whole component, its centre.
-        direction_in_model: unit normal of a plane or point, unit axis of a hole, pin, cylinder or edge; for ``fit`` +Z.
-        diameter_mm: of round features only.
+        direction_in_model: unit normal of a plane or point, unit axis of a hole, pin, slot, cylinder or edge; for
+            ``fit`` +Z.
+        diameter_mm: of round features, and width of a slot.
         locks: degrees of freedom that it may lock.
+        targets_in_model: datum targets (ISO 5459): points of a plane, measured only around them; none: all of it.
     """
 
     label: str
@@ -114,6 +116,7 @@ class Datum:
     direction_in_model: Vector
     diameter_mm: float | None = None
     locks: tuple[str, ...] = DOF_NAMES
+    targets_in_model: tuple[Vector, ...] = ()
 
     @property
     def feature_name(self) -> str:
@@ -127,6 +130,8 @@ CharacteristicKind = Literal[
 ]  # fmt: skip
 """Characteristics of a drawing: those with a tolerance zone (ISO 1101), and those between limits."""
 
+MaterialCondition = Literal["", "maximum", "least"]
+"""The limit of size at which a zone is smallest."""
 ZoneShape = Literal["diameter", "sphere", "width"]
 """A tolerance zone: a cylinder about an axis, a sphere, or the space between two planes."""
 
@@ -145,7 +150,8 @@ class Characteristic:
         zone: shape of the zone.
         direction_in_model: (3,) unit, across a zone between planes or along a distance; None: the feature's own.
         datums: labels of the datums of its frame, in order of precedence; what they leave free is free.
-        is_at_maximum: the zone grows with the distance of the measured size from maximum material.
+        offset_mm: how far the middle of a zone between planes lies off nominal, along its direction (ISO 1101, UZ).
+        material: the zone grows with the distance of the measured size from this limit (ISO 2692); empty: it does not.
         datums_at_maximum: labels of the round datums from which the features may shift by that distance.
         source: where it comes from, such as a balloon of the drawing or the PMI of the CAD file.
     """
@@ -158,7 +164,8 @@ class Characteristic:
     zone: ZoneShape = "width"
     direction_in_model: Vector | None = None
     datums: tuple[str, ...] = ()
-    is_at_maximum: bool = False
+    offset_mm: float = 0.0
+    material: MaterialCondition = ""
     datums_at_maximum: tuple[str, ...] = ()
     source: str = ""
 

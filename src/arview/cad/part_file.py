@@ -29,7 +29,7 @@ from arview.cad.part import (
 )
 from arview.cad.rework_table import read_rework, read_rework_kinds
 from arview.cad.shape.symmetry import Symmetry
-from arview.cad.toml_table import TomlTable
+from arview.cad.toml_table import TomlTable, vectors
 from arview.cad.view_range import UP_AXES, Up, ViewRange
 from arview.core.checks import PATH, check_type
 from arview.errors import InputError
@@ -40,7 +40,7 @@ TABLES = (
     "part", "view_range", "guides", "defaults", "components", "symmetry", "datums", "features", "characteristics",
     "rework",
 )  # fmt: skip
-DATUM_FEATURES = ("plane", "hole", "pin", "cylinder", "edge", "point", "fit")
+DATUM_FEATURES = ("plane", "hole", "pin", "slot", "cylinder", "edge", "point", "fit")
 
 PART_FILE_EXAMPLE = """\
 # A part file. Lengths in mm, angles in degrees, positions in the frame of the CAD file.
@@ -128,18 +128,20 @@ text = "MAG, seam 3 mm"
 # locks what it determines and those before it have left free (ISO 5459). What all leave free, here the
 # rotation about B, the best fit of the base decides; so it does without any datums.
 [datums.A]
-feature = "plane"              # plane, hole, pin (their rim), cylinder (the axis of a round face), edge (straight, of
-                               # two flat faces), point (where its normal meets the surface), or fit (of a component)
+feature = "plane"              # plane, hole, pin (their rim), slot (its rim, two half circles and two lines), cylinder
+                               # (the axis of a round face), edge (straight, of two flat faces), point (where its
+                               # normal meets the surface), or fit (of a component)
 component = "base_plate"
 point_mm = [0.0, 0.0, 0.0]
 normal = [0.0, 0.0, 1.0]
+# targets_mm = [[-90.0, 60.0, 0.0], [90.0, 60.0, 0.0], [0.0, -60.0, 0.0]]   # datum targets: only around these points
 
 [datums.B]
 feature = "hole"               # or "pin"
 component = "base_plate"
 point_mm = [-97.0, -67.0, 0.0] # on the axis, at the end that the camera sees
 axis = [0.0, 0.0, 1.0]
-diameter_mm = 12.0
+diameter_mm = 12.0             # of a slot: width_mm
 locks = ["tx", "ty"]           # default: all that it determines; of rx ry rz tx ty tz, axes of the model
 
 # Features that the drawing limits, each named as it is called in the reports and described as a datum is.
@@ -161,7 +163,9 @@ tolerance_mm = 0.4             # diameter or width of the zone
 # zone = "diameter"            # default for round features; "sphere" for components and points, "width" for others
 # direction = [1.0, 0.0, 0.0]  # across a zone of some width; default: the feature's normal
 datums = ["A", "B"]            # default: all; ["A", "B(M)"] lets it shift by what B is off maximum material
-at_maximum_material = true     # the zone grows by what the bore is wider than its smallest size, see its size
+at_maximum_material = true     # the zone grows by what the bore is wider than its smallest size, see its size; or
+                               # at_least_material
+# offset_mm = 0.1              # of a profile or a position between planes: the zone's middle off nominal (UZ)
 
 [[characteristics]]
 name = "width of bore 1"
@@ -449,10 +453,15 @@ def _read_datums(tables: TomlTable, model: Model, taken: Sequence[str] | None = 
             direction = table.direction("normal" if feature in ("plane", "point") else "axis")
         if feature in ("hole", "pin", "cylinder"):
             diameter_mm = table.positive("diameter_mm", required=True)
+        if feature == "slot":
+            diameter_mm = table.positive("width_mm", required=True)
+        targets: tuple[Vector, ...] = ()
+        if feature == "plane" and taken is None:
+            targets = vectors(table, "targets_mm")
         locks = table.choices("locks", DOF_NAMES) if taken is None else DOF_NAMES
         if label in (taken or ()):
             raise InputError(f"{table.path}: [{table.name}] {label!r} is the name of a component or datum")
         table.finish()
-        datums.append(Datum(label, feature, component, point, direction, diameter_mm, locks))
+        datums.append(Datum(label, feature, component, point, direction, diameter_mm, locks, targets))
     tables.finish()
     return tuple(datums)

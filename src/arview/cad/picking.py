@@ -1,4 +1,4 @@
-"""Features of a component's mesh at a point: the plane, hole, pin, cylinder or edge that can become a datum there.
+"""Features of a component's mesh at a point: the plane, hole, pin, slot, cylinder or edge that can become a datum.
 
 CAD kernels put the vertices of a mesh on the true surface. So the circle through the vertices of a rim and the axis
 from the normals of a round face are those of the surface, up to the rounding of the file, however coarse the mesh is.
@@ -18,7 +18,7 @@ from arview.cad.part import DatumFeature
 from arview.cad.shape.mesh_topology import edge_faces
 from arview.core.fits import fit_circle
 from arview.errors import InputError
-from arview.geometry import Array
+from arview.geometry import Array, from_segment
 
 FLAT_DEG = 0.5
 """Largest angle between the normals of a plane's faces."""
@@ -38,8 +38,8 @@ class PickedFeature:
         feature: its kind, as datums name it.
         point_in_model: (3,) a point on it, mm: middle of a plane, centre of a rim, foot of an axis, middle of an edge.
         direction_in_model: (3,) unit normal of a plane, unit axis of what is round, unit direction of an edge.
-        diameter_mm: of what is round.
-        size_mm: extent: largest of a plane, length of a cylinder or an edge, diameter of a rim.
+        diameter_mm: of what is round; width of a slot.
+        size_mm: extent: largest of a plane, length of a cylinder, an edge or a slot, diameter of a rim.
         distance_mm: from the picked point.
     """
 
@@ -161,21 +161,24 @@ def _cylinder(
 def _rims(component: Component, point: Array, reach_mm: float) -> list[PickedFeature]:
     """Rims near the point, the nearest first: of holes where the material is outside of the circle, else of pins."""
     found = []
-    for rim in find_rims(component):
+    for rim in find_rims(component, with_slots=True):
         offset = point - rim.center_in_model
         height = float(offset @ rim.axis_in_model)
-        aside = float(np.linalg.norm(offset - height * rim.axis_in_model))
+        aside = float(np.linalg.norm(from_segment(offset - height * rim.axis_in_model, rim.half_in_model)))
         distance = float(np.hypot(height, aside - rim.radius_mm))
         if distance > min(reach_mm, 0.5 * rim.radius_mm):
             continue
-        feature: DatumFeature = "hole" if _is_hole(component, rim) else "pin"
+        is_hole, is_slot = _is_hole(component, rim), bool(rim.half_in_model.any())
+        if is_slot and not is_hole:
+            continue
+        feature: DatumFeature = "slot" if is_slot else "hole" if is_hole else "pin"
         found.append(
             PickedFeature(
                 feature,
                 rim.center_in_model,
                 _outward(component, rim),
                 2.0 * rim.radius_mm,
-                2.0 * rim.radius_mm,
+                2.0 * (rim.radius_mm + float(np.linalg.norm(rim.half_in_model))),
                 distance,
             )
         )
@@ -187,12 +190,14 @@ def _wall(component: Component, rim: RoundEdge) -> tuple[Array, Array]:
     vertices, faces = component.vertices_in_model, component.faces.astype(np.int64)
     offset = vertices - rim.center_in_model
     height = offset @ rim.axis_in_model
-    aside = np.linalg.norm(offset - height[:, None] * rim.axis_in_model, axis=1)
+    across = from_segment(offset - height[:, None] * rim.axis_in_model, rim.half_in_model)
+    aside = np.linalg.norm(across, axis=1)
     on_rim = np.hypot(height, aside - rim.radius_mm) < 1e-3 * rim.radius_mm
     touching = faces[on_rim[faces].any(axis=1)]
     normals = _normals(vertices, touching)
     is_wall = np.abs(normals @ rim.axis_in_model) < 0.3
-    return vertices[touching[is_wall]].mean(axis=1) - rim.center_in_model, normals[is_wall]
+    middles = vertices[touching[is_wall]].mean(axis=1) - rim.center_in_model
+    return from_segment(middles, rim.half_in_model), normals[is_wall]
 
 
 def _is_hole(component: Component, rim: RoundEdge) -> bool:

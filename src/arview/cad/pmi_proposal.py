@@ -27,13 +27,12 @@ KINDS = {
 }
 """Kinds of characteristics by the names of OpenCASCADE."""
 MODIFIERS = {
-    "L": "least material, which a part file does not have",
     "theoretical": "it is theoretically exact, so without limits",
     "auxiliary": "it is for information only",
     "Tangent_Plane": "it is of the tangent plane",
 }
 """What modifiers mean that a characteristic cannot express; others are named as OpenCASCADE calls them."""
-EXPRESSED = ("M", "All_Around", "Free_State", "EnvelopeRequirement")
+EXPRESSED = ("M", "L", "All_Around", "Free_State", "EnvelopeRequirement")
 """Modifiers that a characteristic expresses, that only tell faces, or that hold for a part as a photo shows it."""
 
 
@@ -114,6 +113,7 @@ class _Proposal:
             **({} if kind in WITH_LIMITS else {"tolerance_mm": requirement.value_mm}),
             **({"datums": frame} if frame else {}),
             **({"at_maximum_material": True} if "M" in requirement.modifiers else {}),
+            **({"at_least_material": True} if "L" in requirement.modifiers else {}),
         }
         # The profile of one flat face without datums is its flatness.
         kind = "flatness" if kind == "profile" and not frame else kind
@@ -144,7 +144,7 @@ class _Proposal:
         datums = [label.removesuffix(MAXIMUM_MARK) for label in frame]
         sized = [
             *(label for label in datums if f"{label}{MAXIMUM_MARK}" in frame),
-            *(one.label for one in features if "M" in requirement.modifiers),
+            *(one.label for one in features if {"M", "L"} & set(requirement.modifiers)),
         ]
         problems = {
             "it is linked to no face that such a characteristic can be about": not features,
@@ -171,7 +171,8 @@ class _Proposal:
                 len({order for _, order, _ in requirement.datums}) < len(requirement.datums)
             ),
             "it is of its own datum": any(one.label in datums for one in features),
-            f"maximum material without limits of the size of {' and '.join(sized[:2])}": not self._sizes >= {*sized},
+            f"maximum or least material without limits of the size of {' and '.join(sized[:2])}": not self._sizes
+            >= {*sized},
             "it is a further frame of these faces, as the lower one of a composite tolerance": (
                 (kind, requirement.shapes, requirement.modifiers) in self._frames and kind not in WITH_LIMITS
             ),

@@ -153,10 +153,7 @@ class TomlTable:
         """Three numbers; required unless there is a default."""
         if default is not None and not self.known(key):
             return default
-        value = self.take(key)
-        if not isinstance(value, list) or len(value) != 3 or not all(_is_number(item) for item in value):
-            self.fail(key, value, "three numbers [x, y, z]")
-        return float(value[0]), float(value[1]), float(value[2])
+        return _vector(self, key, self.take(key))
 
     def direction(self, key: str) -> Vector:
         """A required vector, scaled to unit length."""
@@ -179,6 +176,21 @@ class TomlTable:
 
     def _where(self) -> str:
         return f"[{self.name}] " if self.name else ""
+
+
+def vectors(table: TomlTable, key: str) -> tuple[Vector, ...]:
+    """A list of vectors; none when the key is absent."""
+    value = table.take(key) if table.known(key) else []
+    if not isinstance(value, list):
+        table.fail(key, value, "a list of [x, y, z]")
+    return tuple(_vector(table, key, item) for item in value)
+
+
+def _vector(table: TomlTable, key: str, value: Any) -> Vector:
+    if not isinstance(value, list) or len(value) != 3 or not all(_is_number(item) for item in value):
+        table.fail(key, value, "three numbers [x, y, z]")
+    x, y, z = value
+    return float(x), float(y), float(z)
 
 
 def _is_number(value: object) -> bool:

@@ -6,6 +6,7 @@ pair comparator, by the edges that only one of both poses has, and by their log 
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from itertools import combinations
 
 import numpy as np
@@ -16,7 +17,7 @@ from arview.detection.scoring.pair_comparator import PairComparator
 from arview.detection.search.hypothesis import Hypothesis
 from arview.detection.search.local_search import DISTINCT_DEG, LocalSearch
 from arview.detection.symmetry import RotationalSymmetries, edge_margin, rotations_about
-from arview.geometry import Array, turned
+from arview.geometry import Array, rigid
 
 PLACE_SHARE = 0.25
 """Distance in diameters within which hypotheses are at the same place."""
@@ -34,6 +35,11 @@ SWEEP_STEP_DEG = 5
 """Step of the rotation sweep about the axes of nearly round parts."""
 MAX_SWEEP_STARTS = 6
 """Best angles of the sweep that are refined."""
+
+
+def turned(b_from_a: Array, turns: Iterable[Array]) -> list[Array]:
+    """A pose (4,4) after each of some turns (3,3) of ``a`` about its origin."""
+    return [rigid(b_from_a[:3, :3] @ turn, b_from_a[:3, 3]) for turn in turns]
 
 
 def is_rotated_by(a: Hypothesis, b: Hypothesis, rotations: Array, angle_deg: float) -> bool:

@@ -33,6 +33,7 @@ from arview.measurement.zones import Zone, with_uncertainty
 ORIENTATIONS = ("perpendicularity", "parallelism", "angularity")
 FORM_NOTE = "the form of the surface between its edges is not in the value"
 MEANS_NOTE = "of the means of {count} cells of the surface: shorter waves are not in the value"
+OFFSET_NOTE = "the middle of the zone lies {offset_mm:+g} mm off nominal"
 OF_WHOLE_NOTE = "{component} as a whole was measured: its shape is taken to be that of the CAD"
 MeasureFeature = Callable[[Datum], tuple[Sequence[DatumEquations], str]]
 """Measures the offsets of a feature, by one or two methods, and has a note about it or an empty text."""
@@ -134,8 +135,8 @@ class _Decisions:
         self.part, self.features, self.frames, self.guard = part, features, frames, guard
         self._frame_of = cache(frames.of)  # the errors of the poses are worked out anew for each
         self.datums = {datum.label: datum for datum in (*part.datums, *part.features)}
-        self.sizes: dict[str, tuple[float, float]] = {}
-        """By feature: how far its size is off maximum material, and U, mm."""
+        self.sizes: dict[tuple[str, str], tuple[float, float]] = {}
+        """By feature and limit of its size: how far its size is off that, and U, mm."""
 
     def result(self, one: Characteristic) -> CharacteristicResult:
         """The result of one characteristic."""
@@ -180,11 +181,10 @@ class _Decisions:
         value = nominal + float(row @ state)
         uncertainty = K * math.sqrt(max(0.0, float(row @ covariance @ row)))
         if one.kind == "size":
-            low, high = one.limits_mm
-            is_hole = self._is_hole(one.of[0])
-            limit = low if is_hole else high
-            if limit is not None:
-                self.sizes[one.of[0]] = (value - limit if is_hole else limit - value, uncertainty)
+            order = ("maximum", "least") if self._is_hole(one.of[0]) else ("least", "maximum")
+            for material, limit, sign in zip(order, one.limits_mm, (1.0, -1.0), strict=True):
+                if limit is not None:
+                    self.sizes[one.of[0], material] = sign * (value - limit), uncertainty
         low, high = one.limits_mm
         verdicts = [decide(value, uncertainty, high, self.guard)] if high is not None else []
         verdicts += [decide(-value, uncertainty, -low, self.guard)] if low is not None else []
@@ -193,7 +193,7 @@ class _Decisions:
     def _is_hole(self, name: str) -> bool:
         datum = self.datums[name]
         if datum.feature != "cylinder":
-            return datum.feature == "hole"
+            return datum.feature in ("hole", "slot")
         return round_faces(self.part.model.component(datum.component), datum)[1] < 0
 
     def _zone(
@@ -203,6 +203,10 @@ class _Decisions:
         alignment, poses = self._frame_of(one.datums)
         state, covariance = joint_state(features, alignment, poses)
         zone = _zone_of(one, features, self._free_motions(one, alignment), alignment.origin_in_model)
+        if one.offset_mm:
+            for index, feature in enumerate(features):
+                state[STATE * index + 3 : STATE * index + 6] -= one.offset_mm * _directions_across(one, feature)[0]
+            empty = replace(empty, notes=(*empty.notes, OFFSET_NOTE.format(offset_mm=one.offset_mm)))
         form = features[0].form
         if one.kind in ("profile", "flatness"):
             note = FORM_NOTE if form is None else MEANS_NOTE.format(count=len(form.points))
@@ -218,7 +222,7 @@ class _Decisions:
         _check_determined(zone, features)
         value, uncertainty = with_uncertainty(zone, state, covariance)
         assert one.tolerance_mm is not None
-        bonus, of_bonus = self._bonus(one.of) if one.is_at_maximum else (0.0, 0.0)
+        bonus, of_bonus = self._bonus(one.of, one.material) if one.material else (0.0, 0.0)
         uncertainty = math.hypot(uncertainty, of_bonus)
         allowed = one.tolerance_mm + bonus
         verdict = decide(value, uncertainty, allowed, self.guard)
@@ -228,16 +232,16 @@ class _Decisions:
             empty, verdict=verdict, value_mm=value, uncertainty_mm=uncertainty, zone_mm=allowed, bonus_mm=bonus,
         )  # fmt: skip
 
-    def _bonus(self, names: Sequence[str]) -> tuple[float, float]:
-        """The smallest distance of some features from maximum material, and its U.
+    def _bonus(self, names: Sequence[str], material: str) -> tuple[float, float]:
+        """The smallest distance of some features from maximum or least material, and its U.
 
         Raises:
             InputError: a size was not measured.
         """
-        missing = [name for name in names if name not in self.sizes]
+        missing = [name for name in names if (name, material) not in self.sizes]
         if missing:
-            raise InputError(f"the size of {', '.join(missing)} was not measured, which maximum material asks for")
-        off, uncertainty = min(self.sizes[name] for name in names)
+            raise InputError(f"the size of {', '.join(missing)} was not measured, which {material} material asks for")
+        off, uncertainty = min(self.sizes[name, material] for name in names)
         return max(0.0, off), uncertainty if off > 0.0 else 0.0
 
     def _free_motions(self, one: Characteristic, alignment: Alignment) -> tuple[Array, Array]:
@@ -254,7 +258,7 @@ class _Decisions:
                 at = point_from_move((equations.points.mean(axis=0) - origin)[None])[0, :, :6] @ locks
                 lengths = np.linalg.norm(at, axis=0)
                 motions.append(locks / np.maximum(lengths, 1e-12))
-                reaches.append(np.full(locks.shape[1], 0.5 * self._bonus([equations.label])[0]))
+                reaches.append(np.full(locks.shape[1], 0.5 * self._bonus([equations.label], "maximum")[0]))
         if one.kind in ORIENTATIONS:
             motions.append(np.eye(6)[:, 3:])
             reaches.append(np.full(3, np.inf))
@@ -335,5 +339,5 @@ def _check_determined(zone: Zone, features: Sequence[MeasuredFeature]) -> None:
         if zone.depends_on(free):
             raise InputError(
                 f"{feature.name}: what was seen of it does not determine "
-                f"{'its tilt' if feature.feature in ('hole', 'pin') else 'all that the zone limits'}"
+                f"{'its tilt' if feature.feature in ('hole', 'pin', 'slot') else 'all that the zone limits'}"
             )

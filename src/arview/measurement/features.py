@@ -17,7 +17,7 @@ from arview.cad import Component, Datum, DatumFeature
 from arview.core.fits import orthogonal_complement
 from arview.geometry import Array
 from arview.measurement.datums.alignment import FORM_MM, Alignment, contribution
-from arview.measurement.datums.cad_features import edge_line, flat_faces, round_faces
+from arview.measurement.datums.cad_features import edge_line, flat_faces, round_faces, slot_edges
 from arview.measurement.datums.datum_fit import DatumFit, check_fit_covered, fit_datum
 from arview.measurement.datums.directions import observable_directions, shift_origin
 from arview.measurement.datums.equations import DatumEquations, DatumNotMeasuredError, point_from_move
@@ -164,10 +164,12 @@ def _solved(
     """A feature from its offsets by one method, as `feature_of` has it; it turns about ``center`` (3,)."""
     fit = fit_datum(one, False)
     check_fit_covered(one, fit)
-    is_rim, axis = datum.feature in ("hole", "pin"), np.array(datum.direction_in_model)
+    axis = np.array(datum.direction_in_model)
     rows = one.rows[:, :6] - one.rows[:, 3:6] @ shift_origin(center)[:, :6]
     unit = _unit(reach_mm)
-    allowed = np.eye(6)[:, 3:] if is_rim or datum.feature == "point" else np.eye(6)
+    allowed = np.eye(6)[:, 3:] if datum.feature in ("hole", "pin", "slot", "point") else np.eye(6)
+    if datum.feature == "slot":
+        allowed = np.concatenate([allowed, np.concatenate([axis, np.zeros(3)])[:, None]], axis=1)
     # The equations of a whole move are its principal directions, of which some are far more certain.
     trusted = np.ones(len(rows)) if one.feature == "fit" else fit.weights
     columns = observable_directions(rows * unit, allowed, trusted)
@@ -269,6 +271,9 @@ def _places(datum: Datum, component: Component) -> Array:
         line = edge_line(component, datum)
         return np.stack([line.start, line.end])
     center = np.array(datum.point_in_model)
+    if datum.feature == "slot":
+        _, middle, half = slot_edges(component, datum)[-1]
+        return np.stack([middle - half, middle + half])
     if datum.feature == "cylinder":
         vertices = component.vertices_in_model[np.unique(component.faces[round_faces(component, datum)[0]])]
         along = (vertices - center) @ np.array(datum.direction_in_model)

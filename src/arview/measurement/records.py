@@ -318,7 +318,7 @@ def _datum_method(one: DatumResult, features: Mapping[str, str]) -> str:
     """The method by which a datum was measured in photos."""
     if one.feature == "fit":
         return "edges" if one.label in features else "sweep and edges"
-    return "edges" if one.feature in ("hole", "pin", "edge") else "sweep"
+    return "edges" if one.feature in ("hole", "pin", "slot", "edge") else "sweep"
 
 
 def failed_datum_text(one: FailedDatum) -> str:

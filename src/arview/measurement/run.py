@@ -111,8 +111,10 @@ def _measure(
         warnings.append(consistency.reason)
     base = base_names(part)
     names = [name for name in part.inspected if name not in base]
-    if not names:
-        raise InputError(f"part {part.name!r}: no component has the role 'inspect'")
+    if not names and not part.characteristics:
+        raise InputError(
+            f"part {part.name!r}: no component has the role 'inspect', and nothing stands in [[characteristics]]"
+        )
     measurands = {name: measurand_of(name, part) for name in names}
     # The views get no covariance of the poses: it is propagated below, relative to the datums.
     reconstruction = in_model_frame(reconstruction, part)

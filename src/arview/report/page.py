@@ -19,7 +19,6 @@ from arview.core.progress import Progress
 from arview.errors import InputError
 from arview.geometry import Array
 from arview.inspection import (
-    CharacteristicResult,
     ComponentDeviation,
     Details,
     Inspection,
@@ -29,6 +28,7 @@ from arview.inspection import (
     verdict_sentence,
 )
 from arview.report import charts, explanations
+from arview.report.characteristics import by_excess, characteristic_row
 from arview.report.decisions import decisions_context
 from arview.report.evidence import ReportEvidence
 from arview.report.formatting import (
@@ -97,11 +97,11 @@ def build_context(evidence: ReportEvidence, progress: Progress) -> dict[str, Any
         "uncertainty_lead": explanations.uncertainty(inspection),
     }
     context |= _components(evidence) | _findings(evidence, gallery)
-    context["characteristics"] = [_characteristic(one) for one in _by_excess(inspection)]
+    context["characteristics"] = [characteristic_row(one) for one in by_excess(inspection)]
     for row in context["characteristics"]:
         if row["name"] in gallery.characteristics:
             row["crop"] = _crop(gallery.characteristics[row["name"]], "ring: its nominal place")
-    context["numbered"] = [_characteristic(one) for one in inspection.characteristics]
+    context["numbered"] = [characteristic_row(one) for one in inspection.characteristics]
     context |= _distance_map(evidence) | _budget(inspection) | _datums(inspection)
     context |= repeatability_context(inspection) | decisions_context(evidence)
     progress("rework", 0, 1)
@@ -216,30 +216,6 @@ def _components(evidence: ReportEvidence) -> dict[str, Any]:
         "rows": rows,
         "components_lead": f"{lead[:1].upper()}{lead[1:]}.",
         "legend": explanations.legend_of(evidence.inspection),
-    }
-
-
-def _by_excess(inspection: Inspection) -> list[CharacteristicResult]:
-    """The characteristics, those that matter most first: failed, not measured, undecided, then by what is left."""
-    order = (Verdict.FAIL, Verdict.NOT_MEASURED, Verdict.UNDECIDED, Verdict.MEASURED, Verdict.PASS)
-    return sorted(inspection.characteristics, key=lambda one: (order.index(one.verdict), -one.excess_mm))
-
-
-def _characteristic(one: CharacteristicResult) -> dict[str, Any]:
-    """A row of the table of characteristics."""
-    return {
-        "name": one.name,
-        "kind": one.kind,
-        "of": ", ".join(one.of),
-        "source": one.source,
-        "datums": " | ".join(one.datums),
-        "value": one.value_text.replace("-", "−") if one.value_mm is not None else NONE,
-        "uncertainty": number(one.uncertainty_mm, decimals_of(one.uncertainty_mm)),
-        "allowed": one.allowed_text.replace("-", "−"),
-        "bonus": number(one.bonus_mm) if one.bonus_mm else NONE,
-        "remark": "; ".join((*([one.reason] if one.reason else []), *one.notes, one.source)).strip("; "),
-        "verdict": one.verdict.value,
-        "word": VERDICT_WORD[one.verdict],
     }
 
 

@@ -47,8 +47,10 @@ def prepare(job: InspectJob, folder: Path) -> Prepared:
     part = load_part(job.part, job.unit)
     if job.serial is not None:
         part = replace(part, serial=job.serial)
-    if not part.inspected:
-        raise InputError(f"part {part.name!r}: no component has the role 'inspect'")
+    if not part.inspected and not part.characteristics:
+        raise InputError(
+            f"part {part.name!r}: no component has the role 'inspect', and nothing stands in [[characteristics]]"
+        )
     if job.masks and job.masks != reconstruction.AUTO and not Path(job.masks).is_dir():
         raise InputError(f"{job.masks}: no such folder; give the folder of the masks, or auto")
     if job.sparse:

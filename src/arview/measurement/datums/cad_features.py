@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.cad import Component, Datum
+from arview.cad import Component, Datum, find_rims
 from arview.errors import InputError
-from arview.geometry import Array
+from arview.geometry import Array, from_segment
 
 _TOLERANCE_MM = 0.05
 """Largest distance of a vertex from the plane, cylinder or line to which it belongs."""
@@ -34,8 +34,33 @@ def flat_faces(component: Component, datum: Datum) -> NDArray[np.bool_]:
     return np.asarray(found)
 
 
+def slot_edges(component: Component, datum: Datum) -> list[tuple[float, Array, Array]]:
+    """Edges of a slot: height along the datum's axis, middle (3,) and half length (3,); the lowest first.
+
+    Raises:
+        InputError: there are none.
+    """
+    axis, point, width = np.array(datum.direction_in_model), np.array(datum.point_in_model), datum.diameter_mm or 0.0
+    found = []
+    for rim in find_rims(component, with_slots=True):
+        arm = rim.center_in_model - point
+        aside = arm - (arm @ axis) * axis
+        if (
+            rim.half_in_model.any()
+            and abs(rim.axis_in_model @ axis) > 0.999
+            and abs(2.0 * rim.radius_mm - width) < 0.03 * width
+            and np.linalg.norm(aside) < 0.25 * width
+        ):
+            found.append((float(arm @ axis), rim.center_in_model, rim.half_in_model))
+    if not found:
+        raise InputError(
+            f"datum {datum.label}: {datum.component!r} has no slot {width:g} mm wide about {list(datum.point_in_model)}"
+        )
+    return sorted(found, key=lambda edge: edge[0])
+
+
 def round_faces(component: Component, datum: Datum) -> tuple[NDArray[np.bool_], float]:
-    """Faces of a cylinder about the datum's axis.
+    """Faces of a cylinder about the datum's axis, or of the wall of a slot.
 
     Returns:
         (F,) which faces these are, and 1 for faces that point outwards (pin), -1 for those of a bore.
@@ -47,6 +72,9 @@ def round_faces(component: Component, datum: Datum) -> tuple[NDArray[np.bool_], 
     axis, radius = np.array(datum.direction_in_model), 0.5 * float(datum.diameter_mm or 0.0)
     arms = corners - np.array(datum.point_in_model)
     radial = arms - (arms @ axis)[..., None] * axis
+    if datum.feature == "slot":
+        half = slot_edges(component, datum)[0][2]
+        radial = from_segment(radial, half)
     near = np.abs(np.linalg.norm(radial, axis=2) - radius).max(axis=1) < max(_TOLERANCE_MM, 0.02 * radius)
     found = near & (np.abs(normals @ axis) < 0.05) & normals.any(axis=1)
     if np.count_nonzero(found) < 6:

@@ -82,15 +82,16 @@ def measure_datum_in_cloud(datum: Datum, model: Model, cloud: CloudPoints, moves
     component = model.component(datum.component)
     if datum.feature == "edge":
         return _measure_edge(datum, model, cloud)
-    is_round = datum.feature in ("hole", "pin", "cylinder")
+    is_round = datum.feature in ("hole", "pin", "cylinder", "slot")
     faces, side = round_faces(component, datum) if is_round else (flat_faces(component, datum), 0.0)
     near, offsets, normals = _offsets(datum, model, cloud, faces)
-    if datum.feature == "point":
-        apart = np.linalg.norm(near.points - np.array(datum.point_in_model), axis=1)
+    middles = (datum.point_in_model,) if datum.feature == "point" else datum.targets_in_model
+    if middles:
+        apart = np.linalg.norm(near.points[:, None] - np.array(middles), axis=2).min(axis=1)
         around = apart < POINT_RADIUS_MM / enlargement(model)
         near, offsets, normals = near.only(around), offsets[around], normals[around]
     _check(datum, len(offsets))
-    if datum.feature in ("hole", "pin"):  # a short bore does not determine the tilt of its axis
+    if datum.feature in ("hole", "pin", "slot"):  # a short bore does not determine the tilt of its axis
         axis = np.array(datum.direction_in_model)
         normals = normals - (normals @ axis)[:, None] * axis
     radius = np.full(len(offsets), side) if is_round else None

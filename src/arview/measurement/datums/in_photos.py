@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from arview.cad import Component, Datum, sample_surface
 from arview.errors import InputError
-from arview.geometry import Array, apply
+from arview.geometry import Array, apply, from_segment
 from arview.measurement.datums.cad_features import edge_line, round_faces
 from arview.measurement.datums.datum_fit import check_covered, robust_weights
 from arview.measurement.datums.equations import (
@@ -67,7 +67,7 @@ def _measure(datum: Datum, views: PhotoViews, moves: Mapping[str, Move]) -> Datu
         if datum.component not in moves:
             raise DatumNotMeasuredError(f"datum {datum.label}: {datum.component!r} could not be measured as a whole")
         return move_equations(datum.label, moves[datum.component], datum.locks)[0]
-    if datum.feature in ("hole", "pin"):
+    if datum.feature in ("hole", "pin", "slot"):
         return _measure_rim(datum, views)
     if datum.feature == "cylinder":
         return _measure_cylinder(datum, views)
@@ -92,6 +92,8 @@ def measure_plane_in_photos(
         lambda: _measure_flat(datum, views),
         lambda: measure_plane_by_edges(datum, views, moves.get(datum.component)),
     )
+    if datum.targets_in_model:
+        return [_measure_flat(datum, views)]
     found: list[DatumEquations] = []
     faults: list[DatumNotMeasuredError] = []
     for way in ways:
@@ -110,10 +112,12 @@ def measure_plane_in_photos(
 
 
 def _measure_flat(datum: Datum, views: PhotoViews) -> DatumEquations:
-    """Offsets of the flat faces of a plane, or of the disc around a point, by the sweep."""
+    """Offsets of the flat faces of a plane, or of the discs around a point or datum targets, by the sweep."""
     component = views.model.component(datum.component)
-    radius_mm = POINT_RADIUS_MM if datum.feature == "point" else None
-    points = plane_samples(component, datum, SAMPLES, radius_mm)
+    middles = (datum.point_in_model,) if datum.feature == "point" else datum.targets_in_model
+    places = [replace(datum, point_in_model=middle) for middle in middles or (datum.point_in_model,)]
+    radius_mm = POINT_RADIUS_MM if middles else None
+    points = np.concatenate([plane_samples(component, place, SAMPLES, radius_mm) for place in places])
     if not len(points):
         raise InputError(f"datum {datum.label}: {datum.component!r} has no flat face at {list(datum.point_in_model)}")
     points = _clear(points, views, component, datum)
@@ -154,7 +158,7 @@ def _clear(points: Array, views: PhotoViews, component: Component, datum: Datum)
 
 
 def _measure_rim(datum: Datum, views: PhotoViews) -> DatumEquations:
-    """Steps of brightness across the rim of a hole or pin; its radius is fitted too."""
+    """Steps of brightness across the rim of a hole, pin or slot; its radius is fitted too, and how a slot turns."""
     center = np.array(datum.point_in_model)
     toward = views.centres.mean(axis=0) - center
     rim = find_rim(views.model, datum, toward)
@@ -167,14 +171,17 @@ def _measure_rim(datum: Datum, views: PhotoViews) -> DatumEquations:
         )
     px_mm = views.mm_per_px(rim.center)
 
+    is_slot = bool(rim.half.any())
+    by_shape = np.stack([radial, np.cross(rim.axis, points - rim.center)][: 1 + is_slot], axis=1)[which]
+
     def edges_at(found: Array) -> tuple[EdgePoints, Array]:
-        moved = points[which] + found[:3] + found[3] * radial[which]
+        moved = points[which] + found[:3] + found[3:] @ by_shape
         return EdgePoints(moved, tangents[which], view), rim.center + found[:3]
 
     def design_of(directions: Array, ok: NDArray[np.bool_]) -> Array:
-        return np.concatenate([directions, np.sum(directions * radial[which[ok]], axis=1)[:, None]], axis=1)
+        return np.concatenate([directions, np.einsum("kx,kux->ku", directions, by_shape[ok])], axis=1)
 
-    steps = _find_steps(datum, views, edges_at, design_of, 4, px_mm)
+    steps = _find_steps(datum, views, edges_at, design_of, 4 + is_slot, px_mm)
     inward_mm = 0.5 * BLUR_PX2 * _curvatures(views, points)[which, view][steps.ok] * steps.mm_per_px
     offsets = steps.offsets + inward_mm * np.sign(steps.design[:, 3])
     equations = surface_equations(
@@ -188,6 +195,8 @@ def _measure_rim(datum: Datum, views: PhotoViews) -> DatumEquations:
         by_radius=steps.design[:, 3],
         locks=datum.locks,
     )
+    if is_slot:
+        return replace(equations, form_mm=RIM_PX * px_mm)
     angles = (np.arange(len(points)) * 2 * np.pi / len(points))[which[steps.ok]]
     shift_mm = rim_shift_mm(steps.design, offsets, steps.variances, angles, RIM_PX * px_mm)
     return replace(equations, form_mm=shift_mm, by_form=waves(steps.design[:, 3], angles))
@@ -294,8 +303,8 @@ def _seen_through(rim: Rim, other: Array, eye: Array) -> NDArray[np.bool_]:
     """(N,) which points of the other rim are seen from a point (3,): for a hole through it, for a pin beside it."""
     toward, height = eye - other, (rim.center - other) @ rim.axis
     at_rim = other + toward * (height / (toward @ rim.axis))[:, None] - rim.center
-    off = np.linalg.norm(at_rim - (at_rim @ rim.axis)[:, None] * rim.axis, axis=1)
-    is_inside = off < rim.radius_mm
+    off = from_segment(at_rim - (at_rim @ rim.axis)[:, None] * rim.axis, rim.half)
+    is_inside = np.linalg.norm(off, axis=1) < rim.radius_mm
     return is_inside if rim.is_hole else ~is_inside
 
 

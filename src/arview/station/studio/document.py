@@ -97,6 +97,7 @@ class StudioDocument:
                     )
                 ],
                 "datums": [_datum_row(datum) for datum in part.datums],
+                "features": [_datum_row(feature) for feature in part.features],
                 "view_range": {
                     "is_declared": part.view_range is not None,
                     "distance_mm": list(view_range.distance_mm),
@@ -134,8 +135,8 @@ class StudioDocument:
         """Carry out an edit of the page.
 
         ``kind`` is one of: ``component`` (names or selectors, key, value), ``part`` (key, value), ``view_range``
-        (value: table or null), ``datum`` (label, value: table or null), ``symmetries`` (value: tables), ``text``
-        (value).
+        (value: table or null), ``datum`` and ``feature`` (label, value: table or null), ``symmetries`` (value: tables),
+        ``text`` (value).
 
         Raises:
             InputError: the edit is unknown, or the part file would not be valid with it.
@@ -145,6 +146,7 @@ class StudioDocument:
             "part": lambda c: self.text.with_value(("part", _one_of(c, "key", PART_KEYS)), c.get("value")),
             "view_range": lambda c: self.text.with_value(("view_range",), _rounded(c.get("value"))),
             "datum": lambda c: self.text.with_value(("datums", _label(c)), _rounded(c.get("value"))),
+            "feature": lambda c: self.text.with_value(("features", str(c.get("label"))), _rounded(c.get("value"))),
             "symmetries": lambda c: self.text.with_list("symmetry", _rounded(_tables(c.get("value")))),
             "text": lambda c: str(c.get("value", "")),
         }
@@ -276,7 +278,7 @@ def _picked_row(component: str, picked: PickedFeature) -> dict[str, Any]:
         _direction_key(picked.feature): [round(float(value), 9) + 0.0 for value in picked.direction_in_model],
     }
     if picked.diameter_mm is not None:
-        table["diameter_mm"] = round(picked.diameter_mm, 6)
+        table["width_mm" if picked.feature == "slot" else "diameter_mm"] = round(picked.diameter_mm, 6)
     return {"datum": table, "size_mm": picked.size_mm, "distance_mm": picked.distance_mm}
 
 

@@ -100,7 +100,7 @@ class PartText:
                 if value is None:
                     return self.text
                 parent[key] = tomlkit.table(
-                    is_super_table=len(tables) == 1 and key in ("components", "datums", "guides")
+                    is_super_table=len(tables) == 1 and key in ("components", "datums", "features", "guides")
                 )
             if not isinstance(parent[key], Table | InlineTable):
                 raise InputError(f"[{'.'.join(keys[: len(tables)])}] is not a table")

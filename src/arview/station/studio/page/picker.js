@@ -1,4 +1,4 @@
-// A click on a face: what is there, and which datum it becomes.
+// A click on a face: what is there, and which datum or feature it becomes.
 
 import { post } from "./api.js";
 import { find, icon, make, shown } from "./dom.js";
@@ -6,8 +6,15 @@ import { find, icon, make, shown } from "./dom.js";
 const LABELS = ["A", "B", "C"];
 
 /** A feature in words: "hole ⌀12.000". */
-export function wordsOf({ feature, diameter_mm }) {
+export function wordsOf({ feature, diameter_mm, width_mm }) {
+  if (feature === "slot") return `slot ${(width_mm ?? diameter_mm).toFixed(3)} wide`;
   return diameter_mm ? `${feature} ⌀${diameter_mm.toFixed(3)}` : feature;
+}
+
+/** A name for a new feature that no feature has. */
+function freeName({ features, components }, kind) {
+  const taken = new Set([...features.map((one) => one.label), ...components.map((one) => one.name)]);
+  for (let number = 1; ; number += 1) if (!taken.has(`${kind}_${number}`)) return `${kind}_${number}`;
 }
 
 export class Picker {
@@ -58,6 +65,14 @@ export class Picker {
         },
       }, label);
     });
+    const name = freeName(this.store.part, datum.feature);
+    buttons.push(make("button", {
+      class: "datum-button", type: "button", "data-label": "feature", "aria-label": `${wordsOf(datum)} becomes the feature ${name}`, title: `Becomes the feature ${name}, for what the drawing requires of it`,
+      onclick: async () => {
+        this.close();
+        await this.store.edit({ kind: "feature", label: name, value: datum });
+      },
+    }, "+"));
     return make("li", { onpointerenter: preview, onfocusin: preview, onpointerleave: () => this.marks.offer() },
       make("span", { class: "feature" }, wordsOf(datum)), make("small", {}, `${shown(size_mm, 1)} mm`), make("span", { class: "datum-buttons" }, buttons));
   }

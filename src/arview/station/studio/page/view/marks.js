@@ -1,4 +1,4 @@
-// Datums and the frame, drawn in the 3D view with labels.
+// Datums, features and the frame, drawn in the 3D view with labels.
 
 import { across, dot, plus, unit } from "../geometry.js";
 import { make } from "../dom.js";
@@ -20,13 +20,13 @@ export class Marks {
     stage.addEventListener("drawn", () => this.#place());
   }
 
-  /** Show the datums of a part. */
+  /** Show the datums and features of a part. */
   show(part) {
     clear(this.group);
     this.#labels.forEach(({ element }) => element.remove());
     this.#labels = [];
     const scale = 0.12 * part.diameter_mm;
-    for (const datum of part.datums) {
+    for (const datum of [...part.datums, ...part.features]) {
       const size = Math.min(2 * scale, datum.size_mm ?? scale);
       this.group.add(lines(outlineOf(datum, size), DATUM), this.#face(part, datum, DATUM));
       const lift = plus(datum.point_mm, datum.direction, datum.feature === "plane" ? 0.6 * scale : 0.5 * scale);
@@ -100,8 +100,8 @@ function outlineOf(datum, size) {
     return [at(-short, 0), at(short, 0), at(0, -short), at(0, short), point, at(0, 0, 0.5 * half)];
   }
   if (datum.feature === "edge") return [at(0, 0, -half), at(0, 0, half)];
-  if (datum.diameter_mm) {
-    const radius = 0.5 * datum.diameter_mm, height = datum.feature === "cylinder" ? half : 0;
+  if (datum.diameter_mm ?? datum.width_mm) {
+    const radius = 0.5 * (datum.diameter_mm ?? datum.width_mm), height = datum.feature === "cylinder" ? half : 0;
     return [...ring(radius, height), ...(height ? ring(radius, -height) : []), at(0, 0, -1.2 * radius - height), at(0, 0, 1.6 * radius + height)];
   }
   return [at(-half, 0), at(half, 0), at(0, -half), at(0, half), point, at(0, 0, half)];
