@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 import trimesh
 
+from arview.cad.datum_check import find_rims
 from arview.cad.model import Component
 from arview.cad.picking import PickedFeature, pick_features
 from arview.errors import InputError
 from arview.geometry import Array, apply, exp_so3, rigid
+from helpers.feature_scene import slot_scene
 
 POSE = rigid(exp_so3([0.4, -0.7, 1.1]), [120.0, -35.0, 60.0])
 
@@ -49,6 +51,18 @@ def test_a_plane_has_its_middle_and_normal(block: Component) -> None:
     assert [one.feature for one in found] == ["plane"]
     assert apply(np.linalg.inv(POSE), found[0].point_in_model[None])[0] == pytest.approx([0, 0, 10], abs=1e-9)
     assert local(found[0].direction_in_model) == pytest.approx([0, 0, 1], abs=1e-9)
+
+
+def test_a_slot_has_its_middle_its_width_and_its_length() -> None:
+    plate = slot_scene().part.model.component("plate")
+    slotted = Component("part", apply(POSE, plate.vertices_in_model), plate.faces)
+    found = pick(slotted, [-20.0, -20.9, 0.0], [0, 0, 1])
+    assert found[0].feature == "slot" and found[0].diameter_mm == pytest.approx(8.0, abs=2e-3)
+    assert apply(np.linalg.inv(POSE), found[0].point_in_model[None])[0] == pytest.approx([-25, -25, 0], abs=1e-3)
+    assert local(found[0].direction_in_model) == pytest.approx([0, 0, 1], abs=1e-6)
+    assert found[0].size_mm == pytest.approx(26.0, abs=2e-3)
+    # A slot is no round rim.
+    assert not [one for one in find_rims(slotted) if one.half_in_model.any()]
 
 
 def test_an_edge_near_the_point_is_offered_with_its_whole_length(block: Component) -> None:

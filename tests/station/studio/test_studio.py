@@ -86,6 +86,15 @@ def test_a_click_on_a_hole_and_the_top_makes_datums(tmp_path: Path, studio: Stud
     assert studio.post("/api/undo")["datums"][-1]["label"] == "A"
     assert len(studio.post("/api/redo")["datums"]) == 2
     assert studio.edit(kind="datum", label="B", value=None)["datums"][0]["label"] == "A"
+    # It can be a feature as well, of which the drawing requires something; then it is not removed.
+    part = studio.edit(kind="feature", label="hole_1", value=hole)
+    assert [(one["label"], one["diameter_mm"]) for one in part["features"]] == [
+        ("hole_1", pytest.approx(12.0, abs=1e-3))
+    ]
+    required = f'{part["text"]}\n[[characteristics]]\nkind = "size"\nof = "hole_1"\nmin_mm = 11.9\n'
+    assert "characteristics" in studio.edit(kind="text", value=required)["text"]
+    refused = studio.edit(422, kind="feature", label="hole_1", value=None)
+    assert "hole_1" in refused["message"] and len(studio.get("/api/part")["features"]) == 1
 
 
 @pytest.mark.parametrize(
