@@ -189,6 +189,27 @@ BAD = [
         r"of = \['post_1'\]: expected a hole, pin, cylinder or slot",
     ),
     ('[[characteristics]]\nkind = "gap"\nof = ["post_1", "post_2"]\nmin_mm = 3\n', "expected flat faces"),
+    (
+        '[features.skin]\nfeature = "surface"\ncomponent = "post_1"\npoint_mm = [0, 0, 0]\n'
+        '[[characteristics]]\nkind = "position"\nof = "skin"\ntolerance_mm = 1\n',
+        'kind = .position.: expected "profile", all that can be required of a surface',
+    ),
+    ('[datums.A]\nfeature = "surface"\ncomponent = "post_1"\n', 'expected one of "plane"'),
+    (
+        '[features.slot]\nfeature = "slot"\ncomponent = "post_1"\npoint_mm = [0, 0, 0]\naxis = [0, 0, 1]\n',
+        "width_mm",
+    ),
+    (
+        '[datums.A]\nfeature = "plane"\ncomponent = "post_1"\npoint_mm = [0, 0, 0]\nnormal = [0, 0, 1]\n'
+        "targets_mm = [[0, 0]]\n",
+        r"targets_mm = \[0, 0\]: expected three numbers",
+    ),
+    (
+        '[[characteristics]]\nkind = "position"\nof = "post_1"\ntolerance_mm = 1\nat_maximum_material = true\n'
+        "at_least_material = true\n",
+        "maximum or least material, not both",
+    ),
+    ('[[characteristics]]\nkind = "position"\nof = "post_1"\ntolerance_mm = 1\noffset_mm = 1\n', "offset_mm"),
     ('[[characteristics]]\nkind = "distance"\nof = "post_1"\nmin_mm = 3\n', "expected two names"),
     ('[[characteristics]]\nkind = "distance"\nof = ["post_1", "post_2"]\n', "expected min_mm below max_mm, or one"),
     (

@@ -50,12 +50,21 @@ def more(scene: FeatureScene) -> tuple[Characteristic, ...]:
 def scene() -> FeatureScene:
     made = feature_scene(1, columns=4, rows=2)
     underside = Datum("underside", "point", "plate", (0.0, 0.0, -8.0), (0.0, 0.0, -1.0))
+    pin = next(one for one in made.part.features if one.feature == "pin")
+    x, y, height = pin.point_in_model
+    side = Datum(
+        "side", "surface", pin.component, (x + 0.5 * (pin.diameter_mm or 0.0), y, 0.5 * height), (0.0, 0.0, 1.0)
+    )
+    skin = Characteristic("skin", "profile", ("side",), 0.3, datums=EVERYTHING)
     part = replace(
         made.part,
-        features=(*made.part.features, underside),
-        characteristics=(*made.part.characteristics, *more(made)),
+        features=(*made.part.features, underside, side),
+        characteristics=(*made.part.characteristics, *more(made), skin),
     )
-    return replace(made, part=part)
+    # A stud that is off and too thin or thick is farthest from nominal where both add up.
+    growth_mm = 0.5 * (made.true_mm[f"{pin.component} size"] - (pin.diameter_mm or 0.0))
+    skin_mm = made.true_mm[f"{pin.component} position"] + 2.0 * abs(growth_mm)
+    return replace(made, part=part, true_mm=made.true_mm | {"skin": skin_mm})
 
 
 @pytest.fixture(scope="module")
@@ -82,6 +91,7 @@ def result(inspection: Inspection, name: str) -> CharacteristicResult:
         ("gap", 0.03, 0.09, 1),
         ("flush", 0.03, 0.09, 1),
         ("parallelism", 0.03, 0.09, 1),
+        ("profile", 0.03, 0.09, 1),
     ],
 )
 def test_values_against_truth(
@@ -93,7 +103,7 @@ def test_values_against_truth(
         if one.kind == kind and one.name in scene.true_mm:
             assert one.value_mm is not None and one.uncertainty_mm is not None, one
             errors.append(abs(one.value_mm - scene.true_mm[one.name]))
-            assert errors[-1] <= one.uncertainty_mm < 0.2, one
+            assert errors[-1] <= one.uncertainty_mm < (0.25 if kind == "profile" else 0.2), one
     assert len(errors) >= count and np.median(errors) <= median_mm and max(errors) <= most_mm, errors
 
 

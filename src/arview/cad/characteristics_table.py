@@ -55,7 +55,11 @@ def _read(table: TomlTable, targets: Mapping[str, DatumFeature], datums: Mapping
     features = {targets[name] for name in of}
     if (kind in OF_TWO and len(of) != 2) or (kind not in (*OF_TWO, "position") and len(of) != 1):
         table.fail("of", list(of), "two names" if kind in OF_TWO else "one name; only a position may be of a pattern")
-    if kind in FLAT_KINDS and features != {"plane"}:
+    if kind == "profile" and features <= {"plane", "surface"}:
+        pass
+    elif "surface" in features:
+        table.fail("kind", kind, '"profile", all that can be required of a surface')
+    elif kind in FLAT_KINDS and features != {"plane"}:
         table.fail("of", list(of), f'flat faces: {kind} is of features whose feature is "plane"')
     if kind == "size" and not features <= set(SIZED):
         table.fail("of", list(of), "a hole, pin, cylinder or slot")
@@ -87,7 +91,7 @@ def _read(table: TomlTable, targets: Mapping[str, DatumFeature], datums: Mapping
     offset_mm = (table.number("offset_mm") if is_flat_zone else None) or 0.0
     if set(of) & set(labels):
         table.fail("of", list(of), "no feature that is one of its own datums")
-    if tolerance_mm and zone == "width" and direction is None and not features <= {"plane", "point"}:
+    if tolerance_mm and zone == "width" and direction is None and not features <= {"plane", "point", "surface"}:
         table.fail("direction", None, "a direction across the zone, because the feature has no normal")
     name = table.line("name", f"{kind} of {' and '.join(of)}")
     source = table.line("source", "")

@@ -19,7 +19,7 @@ NamedPoint = Literal["mass", "seat", "axis", "hole"]
 """Points of a component by which its place is stated: centre of mass, middle of the surface on which it stands, foot of
 its axis, centre of its hole."""
 
-DatumFeature = Literal["plane", "hole", "pin", "slot", "cylinder", "edge", "point", "fit"]
+DatumFeature = Literal["plane", "hole", "pin", "slot", "cylinder", "edge", "point", "surface", "fit"]
 ReworkVerb = Literal["towards", "away from"]
 DOF_NAMES = ("rx", "ry", "rz", "tx", "ty", "tz")
 """Degrees of freedom: rotations about and translations along the axes of the model."""
@@ -101,7 +101,8 @@ class Datum:
         label: A, B, C, ….
         feature: its kind.
         component: name of the component that carries it.
-        point_in_model: a point on it, mm; for ``fit``, the best fit of a whole component, its centre.
+        point_in_model: a point on it, mm; for ``fit``, the best fit of a whole component, its centre. A surface is all
+            that is joined with that point without a sharp edge.
         direction_in_model: unit normal of a plane or point, unit axis of a hole, pin, slot, cylinder or edge; for
             ``fit`` +Z.
         diameter_mm: of round features, and width of a slot.

@@ -144,7 +144,8 @@ axis = [0.0, 0.0, 1.0]
 diameter_mm = 12.0             # of a slot: width_mm
 locks = ["tx", "ty"]           # default: all that it determines; of rx ry rz tx ty tz, axes of the model
 
-# Features that the drawing limits, each named as it is called in the reports and described as a datum is.
+# Features that the drawing limits, each named as it is called in the reports and described as a datum is; or a
+# "surface": all that is joined with point_mm without a sharp edge, for its profile.
 [features.bore_1]
 feature = "hole"
 component = "base_plate"
@@ -442,7 +443,8 @@ def _read_datums(tables: TomlTable, model: Model, taken: Sequence[str] | None = 
     datums, names = [], [component.name for component in model.components]
     for label in tables.content:
         table = tables.table(label)
-        feature = cast(DatumFeature, table.choice("feature", DATUM_FEATURES, required=True))
+        kinds = DATUM_FEATURES if taken is None else (*DATUM_FEATURES, "surface")
+        feature = cast(DatumFeature, table.choice("feature", kinds, required=True))
         component = table.text("component")
         if component not in names:
             raise InputError(f"{table.path}: [{table.name}] {unknown_component(component, names)}")
@@ -450,6 +452,7 @@ def _read_datums(tables: TomlTable, model: Model, taken: Sequence[str] | None = 
         point, direction, diameter_mm = (x, y, z), (0.0, 0.0, 1.0), None
         if feature != "fit":
             point = table.vector("point_mm")
+        if feature not in ("fit", "surface"):
             direction = table.direction("normal" if feature in ("plane", "point") else "axis")
         if feature in ("hole", "pin", "cylinder"):
             diameter_mm = table.positive("diameter_mm", required=True)

@@ -203,16 +203,16 @@ class _Decisions:
         alignment, poses = self._frame_of(one.datums)
         state, covariance = joint_state(features, alignment, poses)
         zone = _zone_of(one, features, self._free_motions(one, alignment), alignment.origin_in_model)
+        form = features[0].form if one.kind in ("profile", "flatness") else None
         if one.offset_mm:
-            for index, feature in enumerate(features):
+            for index, feature in enumerate(features if form is None else ()):
                 state[STATE * index + 3 : STATE * index + 6] -= one.offset_mm * _directions_across(one, feature)[0]
             empty = replace(empty, notes=(*empty.notes, OFFSET_NOTE.format(offset_mm=one.offset_mm)))
-        form = features[0].form
         if one.kind in ("profile", "flatness"):
             note = FORM_NOTE if form is None else MEANS_NOTE.format(count=len(form.points))
             empty = replace(empty, notes=(*empty.notes, note))
             if form is not None:
-                state = np.concatenate([state, form.offsets_mm])
+                state = np.concatenate([state, form.offsets_mm - one.offset_mm])
                 covariance = np.block([
                     [covariance, np.zeros((len(covariance), len(form.variances)))],
                     [np.zeros((len(form.variances), len(covariance))), np.diag(form.variances)],
@@ -276,12 +276,12 @@ def _zone_of(
     size = STATE * len(features) + (0 if form is None else len(form.points))
     rows, by_motion = [], []
     for index, feature in enumerate(features):
-        across = _directions_across(one, feature)
+        across = _directions_across(one, feature) if form is None else form.normals[:, None]
         places = feature.places if form is None else form.points
         if one.kind == "position" and feature.feature in ("fit", "point", "hole", "pin"):
             places = feature.center[None]
         own = across @ point_from_move(places - feature.center)[:, :, :6]  # (P,D,6)
-        row = np.zeros((len(places), len(across), size))
+        row = np.zeros((len(places), across.shape[-2], size))
         row[:, :, STATE * index : STATE * index + 6] = own
         if form is not None:
             row[np.arange(len(places)), 0, STATE * len(features) + np.arange(len(places))] = 1.0

@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arview.cad import Component, Datum, DatumFeature
-from arview.core.fits import orthogonal_complement
+from arview.core.fits import orthogonal_complement, robust_sigma
 from arview.geometry import Array
 from arview.measurement.datums.alignment import FORM_MM, Alignment, contribution
-from arview.measurement.datums.cad_features import edge_line, flat_faces, round_faces, slot_edges
-from arview.measurement.datums.datum_fit import DatumFit, check_fit_covered, fit_datum
+from arview.measurement.datums.cad_features import edge_line, flat_faces, round_faces, slot_edges, surface_faces
+from arview.measurement.datums.datum_fit import check_fit_covered, fit_datum
 from arview.measurement.datums.directions import observable_directions, shift_origin
 from arview.measurement.datums.equations import DatumEquations, DatumNotMeasuredError, point_from_move
 from arview.measurement.datums.options import REACH_MM
@@ -32,10 +32,16 @@ STATE = 7
 """Numbers of a feature's state: twist about its centre in model axes (rad, mm), and the change of its radius, mm."""
 CELLS = 5
 """Cells along each side of a flat face of whose points the means are its form."""
+CORRELATED_POINTS = 10.0
+"""Neighbouring points whose errors count as one."""
+CURVED_CELLS = 3
+"""The same for a curved surface, along each side of its box; they are divided further by the signs of the normal."""
 MIN_CELL_POINTS = 4
 """Points of a cell below which its mean says nothing."""
 MAX_MOVE_MM = 2.0 * REACH_MM
 """Displacement of any part of a feature beyond which it was matched wrongly: it is searched for within half of that."""
+CLEAR_SHARE = 0.1
+"""Share of what a curved surface tells best of its motion below which it is taken to tell nothing."""
 MIN_SPAN = 0.5
 """Share of a face's length and width over which it must be measured: a strip in a gap is matched wrongly."""
 RADIUS_PX = 0.02
@@ -43,16 +49,18 @@ RADIUS_PX = 0.02
 
 
 @dataclass(frozen=True)
-class FlatForm:
-    """Deviation of a flat face from its own best plane.
+class SurfaceForm:
+    """Deviation of a face or surface from its CAD at its own best place.
 
     Attributes:
         points: (B,3) middles of its cells, mm.
-        offsets_mm: (B,) along its normal.
+        normals: (B,3) unit.
+        offsets_mm: (B,) along them.
         variances: (B,) mm².
     """
 
     points: Array
+    normals: Array
     offsets_mm: Array
     variances: Array
 
@@ -72,7 +80,7 @@ class MeasuredFeature:
         covariance: (7,7) of its own noise and form.
         undetermined: (K,7) states of about a millimetre that the data leave free.
         by_poses: (7,P) derivative by the camera poses.
-        form: of a flat face, where its surface was measured.
+        form: of a face or surface, where it was measured.
         note: what its measurement takes for granted, or empty.
     """
 
@@ -86,7 +94,7 @@ class MeasuredFeature:
     covariance: Array
     undetermined: Array
     by_poses: Array
-    form: FlatForm | None = None
+    form: SurfaceForm | None = None
     note: str = ""
 
 
@@ -112,7 +120,11 @@ def feature_of(
     middle = ways[0].points.mean(axis=0)
     places = _places(datum, component)
     # A rim is centred on its axis, at the end that is seen; a face or an edge in its own middle.
-    center = places.mean(axis=0) if datum.feature in ("plane", "edge") else point + axis * (axis @ (middle - point))
+    center = (
+        places.mean(axis=0)
+        if datum.feature in ("plane", "edge", "surface")
+        else point + axis * (axis @ (middle - point))
+    )
     reach_mm = max(1.0, float(np.sqrt(np.mean(np.sum((ways[0].points - center) ** 2, axis=1)))))
     found: list[MeasuredFeature] = []
     faults: list[DatumNotMeasuredError] = []
@@ -173,6 +185,11 @@ def _solved(
     # The equations of a whole move are its principal directions, of which some are far more certain.
     trusted = np.ones(len(rows)) if one.feature == "fit" else fit.weights
     columns = observable_directions(rows * unit, allowed, trusted)
+    is_curved = datum.feature == "surface"
+    if is_curved:
+        # What its shape hardly tells stays in its form: facets would seem to tell how a cylinder turns about its axis.
+        _, values, right = np.linalg.svd(rows * unit @ columns, full_matrices=False)
+        columns = columns @ right[values > CLEAR_SHARE * values[0]].T
     design = rows @ (columns * unit[:, None])
     if one.by_radius is not None:
         design = np.concatenate([design, one.by_radius[:, None]], axis=1)
@@ -186,6 +203,8 @@ def _solved(
     covariance = contribution(gain, one, fit)
     if one.by_radius is not None:
         covariance[6, 6] += (RADIUS_PX * px_mm) ** 2 + FORM_MM**2
+    if is_curved:  # the noise of its cells, which hold what the motion leaves, is that of both
+        covariance[:] = 0.0
     state = gain @ one.offsets_mm
     across = point_from_move(places - center)[:, :, :6] @ state[:6]
     in_plane = orthogonal_complement(axis[None]).T
@@ -195,7 +214,7 @@ def _solved(
         raise DatumNotMeasuredError(
             f"datum {datum.label} ({datum.feature}): what was seen of it does not tell where all of it is"
         )
-    free = orthogonal_complement(columns.T) * unit
+    free = np.zeros((0, 6)) if is_curved else orthogonal_complement(columns.T) * unit
     return MeasuredFeature(
         datum.label,
         datum.feature,
@@ -207,8 +226,8 @@ def _solved(
         covariance=covariance,
         undetermined=np.concatenate([free, np.zeros((len(free), 1))], axis=1),
         by_poses=np.zeros((STATE, 0)) if poses is None else gain @ poses.offsets(one),
-        form=_form(one, fit, one.offsets_mm - design @ solution @ one.offsets_mm, axis)
-        if one.feature == "plane"
+        form=_form(one, one.offsets_mm - design @ solution @ one.offsets_mm, axis)
+        if one.feature in ("plane", "surface")
         else None,
     )
 
@@ -264,9 +283,9 @@ def joint_state(
 
 def _places(datum: Datum, component: Component) -> Array:
     """(V,3) points between which a feature extends: corners of a face, ends of an axis or edge."""
-    if datum.feature == "plane":
-        faces = component.faces[flat_faces(component, datum)]
-        return component.vertices_in_model[np.unique(faces)]
+    if datum.feature in ("plane", "surface"):
+        find_faces = flat_faces if datum.feature == "plane" else surface_faces
+        return component.vertices_in_model[np.unique(component.faces[find_faces(component, datum)])]
     if datum.feature == "edge":
         line = edge_line(component, datum)
         return np.stack([line.start, line.end])
@@ -282,19 +301,34 @@ def _places(datum: Datum, component: Component) -> Array:
     return center + np.outer([0.0, datum.diameter_mm or 1.0], datum.direction_in_model)
 
 
-def _form(one: DatumEquations, fit: DatumFit, residuals: Array, normal: Array) -> FlatForm | None:
-    """Means of the residuals (N,) of a plane over cells of its surface; None where there are too few for a form."""
-    inlying = fit.inliers
-    places = one.points @ orthogonal_complement(normal[None]).T
-    low, size = places.min(axis=0), np.maximum(np.ptp(places, axis=0), 1e-9)
-    cells = np.minimum((CELLS * (places - low) / size).astype(int), CELLS - 1)
-    keys = np.where(inlying, cells[:, 0] * CELLS + cells[:, 1], -1)
-    weights = np.where(inlying, 1.0 / fit.variances, 0.0)
-    kept: list[NDArray[np.bool_]] = [keys == key for key in np.unique(keys[keys >= 0])]
-    kept = [of for of in kept if np.count_nonzero(of) >= MIN_CELL_POINTS]
+def _form(one: DatumEquations, residuals: Array, normal: Array) -> SurfaceForm | None:
+    """Means of the residuals (N,) of a face over cells of its surface; None where there are too few for a form.
+
+    Outliers of the fit count where they are most of a cell: a dent is no error of measurement.
+    """
+    if one.feature == "plane":
+        normals = np.tile(normal, (len(residuals), 1))
+        cells = _cells(one.points @ orthogonal_complement(normal[None]).T, CELLS)
+    else:
+        normals = one.rows[:, 3:6]
+        cells = np.concatenate([_cells(one.points, CURVED_CELLS), (normals > 0.0).astype(int)], axis=1)
+    _, keys = np.unique(cells, axis=0, return_inverse=True)
+    groups = [keys.ravel() == key for key in range(keys.max() + 1)]
+    middle = np.sum([np.where(of, np.median(residuals[of]), 0.0) for of in groups], axis=0)
+    sigma_mm = robust_sigma(residuals - middle)
+    groups = [of & (np.abs(residuals - middle) <= 3.0 * sigma_mm) for of in groups]
+    kept: list[NDArray[np.bool_]] = [of for of in groups if np.count_nonzero(of) >= MIN_CELL_POINTS]
     if len(kept) < CELLS:
         return None
-    sums = np.array([weights[of].sum() for of in kept])
-    means = np.array([(weights[of] * residuals[of]).sum() for of in kept]) / sums
+    weights = 1.0 / one.variances
+    means = np.array([np.average(residuals[of], weights=weights[of]) for of in kept])
+    variances = np.array([sigma_mm**2 / max(1.0, np.count_nonzero(of) / CORRELATED_POINTS) for of in kept])
     middles = np.stack([np.average(one.points[of], axis=0, weights=weights[of]) for of in kept])
-    return FlatForm(middles, means, 1.0 / sums)
+    along = np.stack([np.average(normals[of], axis=0, weights=weights[of]) for of in kept])
+    return SurfaceForm(middles, along / np.linalg.norm(along, axis=1, keepdims=True), means, variances)
+
+
+def _cells(places: Array, count: int) -> NDArray[np.int64]:
+    """(N,D) which of ``count`` cells along each axis of their box some places (N,D) are in."""
+    low, size = places.min(axis=0), np.maximum(np.ptp(places, axis=0), 1e-9)
+    return np.asarray(np.minimum(count * (places - low) / size, count - 1), dtype=np.int64)

@@ -6,13 +6,19 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
-from arview.cad import Component, Datum, find_rims
+from arview.cad import Component, Datum, edge_faces, find_rims
 from arview.errors import InputError
 from arview.geometry import Array, from_segment
+from arview.measurement.cloud.mesh_surface import MeshSurface
+from arview.measurement.datums.options import REACH_MM
 
 _TOLERANCE_MM = 0.05
 """Largest distance of a vertex from the plane, cylinder or line to which it belongs."""
+SHARP_DEG = 25.0
+"""Angle between faces from which their common edge bounds a surface."""
 
 
 def _faces(component: Component) -> tuple[Array, Array]:
@@ -84,6 +90,27 @@ def round_faces(component: Component, datum: Datum) -> tuple[NDArray[np.bool_], 
         )
     outward = np.sum(normals[found] * radial[found].mean(axis=1), axis=1)
     return np.asarray(found), 1.0 if np.mean(outward > 0) > 0.5 else -1.0
+
+
+def surface_faces(component: Component, datum: Datum) -> NDArray[np.bool_]:
+    """(F,) which faces are joined with that at the datum's point without a sharp edge.
+
+    Raises:
+        InputError: the point is not on the component.
+    """
+    surface = MeshSurface(component.vertices_in_model, component.faces)
+    start = surface.closest(np.array([datum.point_in_model]), REACH_MM).faces[0]
+    if start < 0:
+        raise InputError(
+            f"datum {datum.label}: {list(datum.point_in_model)} is not on the surface of {datum.component!r}"
+        )
+    edges, normals = edge_faces(component.faces), surface.face_normals
+    joined = edges.faces[edges.face_count == 2]
+    is_smooth = np.einsum("ex,ex->e", *normals[joined.T]) > np.cos(np.deg2rad(SHARP_DEG))
+    first, second = joined[is_smooth].T
+    size = (len(normals), len(normals))
+    _, labels = connected_components(coo_matrix((np.ones(len(first)), (first, second)), shape=size), directed=False)
+    return np.asarray(labels == labels[start])
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from arview.geometry import Array
 from arview.measurement.cloud.enlarged import enlargement
 from arview.measurement.cloud.mesh_surface import MeshSurface
 from arview.measurement.cloud.points import CloudPoints, prepare_cloud
-from arview.measurement.datums.cad_features import edge_line, flat_faces, round_faces
+from arview.measurement.datums.cad_features import edge_line, flat_faces, round_faces, surface_faces
 from arview.measurement.datums.datum_fit import robust_weights
 from arview.measurement.datums.equations import (
     DatumEquations,
@@ -83,7 +83,8 @@ def measure_datum_in_cloud(datum: Datum, model: Model, cloud: CloudPoints, moves
     if datum.feature == "edge":
         return _measure_edge(datum, model, cloud)
     is_round = datum.feature in ("hole", "pin", "cylinder", "slot")
-    faces, side = round_faces(component, datum) if is_round else (flat_faces(component, datum), 0.0)
+    find_faces = surface_faces if datum.feature == "surface" else flat_faces
+    faces, side = round_faces(component, datum) if is_round else (find_faces(component, datum), 0.0)
     near, offsets, normals = _offsets(datum, model, cloud, faces)
     middles = (datum.point_in_model,) if datum.feature == "point" else datum.targets_in_model
     if middles:

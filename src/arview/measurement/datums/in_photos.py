@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from arview.cad import Component, Datum, sample_surface
 from arview.errors import InputError
 from arview.geometry import Array, apply, from_segment
-from arview.measurement.datums.cad_features import edge_line, round_faces
+from arview.measurement.datums.cad_features import edge_line, round_faces, surface_faces
 from arview.measurement.datums.datum_fit import check_covered, robust_weights
 from arview.measurement.datums.equations import (
     DatumEquations,
@@ -69,8 +69,8 @@ def _measure(datum: Datum, views: PhotoViews, moves: Mapping[str, Move]) -> Datu
         return move_equations(datum.label, moves[datum.component], datum.locks)[0]
     if datum.feature in ("hole", "pin", "slot"):
         return _measure_rim(datum, views)
-    if datum.feature == "cylinder":
-        return _measure_cylinder(datum, views)
+    if datum.feature in ("cylinder", "surface"):
+        return _measure_surface(datum, views)
     if datum.feature == "edge":
         return _measure_edge(datum, views)
     if datum.feature == "point":
@@ -311,34 +311,35 @@ def _seen_through(rim: Rim, other: Array, eye: Array) -> NDArray[np.bool_]:
 # --- cylinders and edges ---------------------------------------------------------------------------------
 
 
-def _measure_cylinder(datum: Datum, views: PhotoViews) -> DatumEquations:
-    """Offsets of the round faces by the sweep with curved patches; the radius is fitted and discarded."""
+def _measure_surface(datum: Datum, views: PhotoViews) -> DatumEquations:
+    """Offsets of curved faces by the sweep with curved patches; the radius of a cylinder is fitted."""
     component, index = views.model.component(datum.component), views.model.index(datum.component)
-    faces, side = round_faces(component, datum)
+    is_round = datum.feature == "cylinder"
+    faces, side = round_faces(component, datum) if is_round else (surface_faces(component, datum), 0.0)
     px_mm = views.mm_per_px(np.array(datum.point_in_model))
     samples = sample_surface(replace(component, faces=component.faces[faces]), 3.0 * px_mm, SAMPLES)
     apart = ~near_others(samples.points, views.model, index, MIN_CLEAR_MM)
     samples = samples.of(apart & ~near_edges(samples.points, component, SWEEP_EDGE_PX * px_mm))
     if len(samples.points) < MIN_SAMPLES:
         raise DatumNotMeasuredError(
-            f"datum {datum.label} (cylinder): too little of it is clear of edges and other components"
+            f"datum {datum.label} ({datum.feature}): too little of it is clear of edges and other components"
         )
     found = sweep_offsets(samples.points, samples.normals, views, REACH_MM, index)
     ok, seen = found.is_ok, int(np.count_nonzero((found.views >= 0).sum(axis=1) >= MIN_VIEWS))
     axis = np.array(datum.direction_in_model)
     radial = samples.points - np.array(datum.point_in_model)
     radial = side * (radial - (radial @ axis)[:, None] * axis)
-    radial /= np.linalg.norm(radial, axis=1, keepdims=True)
+    radial = radial / np.linalg.norm(radial, axis=1, keepdims=True) if is_round else samples.normals
     variances = found.variances_mm2 + MIN_SIGMA_MM**2
     return surface_equations(
         datum.label,
-        "cylinder",
+        datum.feature,
         samples.points[ok],
         normals=radial[ok],
         offsets_mm=found.offsets_mm[ok],
         variances=variances[ok],
         of=seen,
-        by_radius=np.full(np.count_nonzero(ok), side),
+        by_radius=np.full(np.count_nonzero(ok), side) if is_round else None,
         locks=datum.locks,
     )
 
