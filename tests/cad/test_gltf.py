@@ -298,7 +298,7 @@ def test_hostile_files_are_refused_at_once(changes: dict[str, Any], expected: st
     start = time.process_time()
     with pytest.raises(InputError, match=expected) as caught:
         load_model(path)
-    assert time.process_time() - start < 2.0
+    assert time.process_time() - start < 10.0  # a library may be imported in it; a billion elements take minutes
     assert "\n" not in str(caught.value) and str(path) in str(caught.value)
 
 
