@@ -79,6 +79,8 @@ def test_from_a_bare_step_file_to_a_tracked_part(chromium: Any, tmp_path: Path) 
             assert "hole ⌀12.000" in offered.first.inner_text()
             become(offered, "hole", label)
             page.settled()
+        become(page.click([97.0, -67.0 + 6.0 + RIM_MM, 0.0]), "hole", "feature")
+        page.settled()
         page.page.click("[data-look=iso]")
         page.page.wait_for_timeout(300)
         page.photograph("datums")
@@ -87,6 +89,8 @@ def test_from_a_bare_step_file_to_a_tracked_part(chromium: Any, tmp_path: Path) 
         assert datums["B"]["point_mm"] == pytest.approx([-97.0, -67.0, 0.0], abs=1e-4)
         assert datums["C"]["point_mm"] == pytest.approx([97.0, -67.0, 0.0], abs=1e-4)
         assert datums["B"]["diameter_mm"] == pytest.approx(12.0, abs=1e-3)
+        (feature,) = studio.get("/api/part")["features"]
+        assert feature["label"] == "hole_1" and page.page.get_by_label("Remove feature hole_1").count() == 1
 
         page.tab("Range")
         put_range(page, distance_mm=(400.0, 660.0), elevation_deg=(20.0, 68.0), azimuth_deg=(-160.0, 30.0))
