@@ -16,7 +16,7 @@ from arview.measurement.folder import MetricReconstruction, read_cloud
 from arview.measurement.options import MeasureOptions
 from arview.measurement.run import measure
 from helpers.cad_files import box
-from helpers.feature_scene import feature_scene
+from helpers.feature_scene import feature_scene, slot_scene
 from helpers.synthetic import post
 
 
@@ -30,6 +30,7 @@ def cloud_of(built: Model, folder: Path, count: int) -> MetricReconstruction:
     return replace(cloud, scale=replace(cloud.scale, model_from_scan=np.eye(4)))
 
 
+@pytest.mark.slow  # a cloud of some hundred thousand points
 def test_the_profile_of_a_curved_surface_shows_size_and_dent(tmp_path: Path) -> None:
     """A boss of ⌀40 is 0.1 mm too thick all around; with a dent of 0.3 mm over a sixth of it in the second case."""
     for dent_mm, true_mm in ((0.0, 0.2), (0.3, 0.4)):
@@ -72,3 +73,14 @@ def test_a_cloud_tells_places_sizes_gaps_and_tilts(tmp_path: Path) -> None:
         error = abs(one.value_mm - scene.true_mm[one.name])
         assert error <= min(one.uncertainty_mm, 0.03), (one, error)
     assert {Verdict.PASS, Verdict.FAIL} <= {one.verdict for one in found}
+
+
+@pytest.mark.slow  # a cloud of some hundred thousand points
+def test_slots_and_targets_in_a_cloud(tmp_path: Path) -> None:
+    """A frame of three datum targets; what is of slots is within U and 60 µm."""
+    scene = slot_scene()
+    found = measure(cloud_of(scene.built, tmp_path, 400_000), scene.part, MeasureOptions(methods=("cloud",)))
+    assert len(found.characteristics) == len(scene.true_mm)
+    for one in found.characteristics:
+        assert one.value_mm is not None and one.uncertainty_mm is not None, one
+        assert abs(one.value_mm - scene.true_mm[one.name]) <= min(one.uncertainty_mm, 0.06), one

@@ -125,6 +125,8 @@ def feature_of(
         if datum.feature in ("plane", "edge", "surface")
         else point + axis * (axis @ (middle - point))
     )
+    if datum.feature == "slot":  # its tilt is not measured: it is stated where it was seen
+        places = places - np.outer((places - center) @ axis, axis)
     reach_mm = max(1.0, float(np.sqrt(np.mean(np.sum((ways[0].points - center) ** 2, axis=1)))))
     found: list[MeasuredFeature] = []
     faults: list[DatumNotMeasuredError] = []

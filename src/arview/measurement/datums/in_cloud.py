@@ -86,11 +86,6 @@ def measure_datum_in_cloud(datum: Datum, model: Model, cloud: CloudPoints, moves
     find_faces = surface_faces if datum.feature == "surface" else flat_faces
     faces, side = round_faces(component, datum) if is_round else (find_faces(component, datum), 0.0)
     near, offsets, normals = _offsets(datum, model, cloud, faces)
-    middles = (datum.point_in_model,) if datum.feature == "point" else datum.targets_in_model
-    if middles:
-        apart = np.linalg.norm(near.points[:, None] - np.array(middles), axis=2).min(axis=1)
-        around = apart < POINT_RADIUS_MM / enlargement(model)
-        near, offsets, normals = near.only(around), offsets[around], normals[around]
     _check(datum, len(offsets))
     if datum.feature in ("hole", "pin", "slot"):  # a short bore does not determine the tilt of its axis
         axis = np.array(datum.direction_in_model)
@@ -132,6 +127,10 @@ def _offsets(
     mine[mine] &= faces[closest.faces[mine]]
     facing = np.sum(near.normals * np.nan_to_num(closest.normals), axis=1)
     mine &= (facing > 0.5) | ~near.normals.any(axis=1)
+    middles = (datum.point_in_model,) if datum.feature == "point" else datum.targets_in_model
+    if middles:
+        apart = np.linalg.norm(near.points[:, None] - np.array(middles), axis=2).min(axis=1)
+        mine &= apart < small * POINT_RADIUS_MM
     chosen, index = np.flatnonzero(mine), model.index(datum.component)
     for clear_mm in (small * CLEAR_MM, small * MIN_CLEAR_MM):
         clear = chosen[~near_others(near.points[chosen], model, index, clear_mm)] if len(chosen) else chosen
