@@ -13,7 +13,7 @@ KINDS = get_args(CharacteristicKind)
 WITH_LIMITS = ("size", "distance", "gap", "flush")
 OF_TWO = ("distance", "gap", "flush")
 FLAT_KINDS = ("profile", "flatness", "gap", "flush")
-"""Kinds that are about flat faces only."""
+"""Kinds that are about flat faces only, but for the profile of a surface."""
 ROUND: tuple[DatumFeature, ...] = ("hole", "pin", "cylinder")
 SIZED: tuple[DatumFeature, ...] = (*ROUND, "slot")
 MAXIMUM_MARK = "(M)"
@@ -55,11 +55,9 @@ def _read(table: TomlTable, targets: Mapping[str, DatumFeature], datums: Mapping
     features = {targets[name] for name in of}
     if (kind in OF_TWO and len(of) != 2) or (kind not in (*OF_TWO, "position") and len(of) != 1):
         table.fail("of", list(of), "two names" if kind in OF_TWO else "one name; only a position may be of a pattern")
-    if kind == "profile" and features <= {"plane", "surface"}:
-        pass
-    elif "surface" in features:
+    if "surface" in features and kind != "profile":
         table.fail("kind", kind, '"profile", all that can be required of a surface')
-    elif kind in FLAT_KINDS and features != {"plane"}:
+    if kind in FLAT_KINDS and not features <= {"plane", "surface"}:
         table.fail("of", list(of), f'flat faces: {kind} is of features whose feature is "plane"')
     if kind == "size" and not features <= set(SIZED):
         table.fail("of", list(of), "a hole, pin, cylinder or slot")

@@ -21,7 +21,7 @@ from arview.measurement.datums.cad_features import edge_line, flat_faces, round_
 from arview.measurement.datums.datum_fit import check_fit_covered, fit_datum
 from arview.measurement.datums.directions import observable_directions, shift_origin
 from arview.measurement.datums.equations import DatumEquations, DatumNotMeasuredError, point_from_move
-from arview.measurement.datums.options import REACH_MM
+from arview.measurement.datums.options import CORRELATED_POINTS, REACH_MM
 from arview.measurement.types import Method, Move
 from arview.measurement.uncertainty.combine import CombinedMove, combine
 from arview.measurement.uncertainty.pose_propagation import PosePropagation
@@ -32,8 +32,6 @@ STATE = 7
 """Numbers of a feature's state: twist about its centre in model axes (rad, mm), and the change of its radius, mm."""
 CELLS = 5
 """Cells along each side of a flat face of whose points the means are its form."""
-CORRELATED_POINTS = 10.0
-"""Neighbouring points whose errors count as one."""
 CURVED_CELLS = 3
 """The same for a curved surface, along each side of its box; they are divided further by the signs of the normal."""
 MIN_CELL_POINTS = 4
@@ -202,11 +200,10 @@ def _solved(
     gain[:6] = (columns * unit[:, None]) @ solution[:count]
     if one.by_radius is not None:
         gain[6] = solution[count]
-    covariance = contribution(gain, one, fit)
+    # The noise of a curved surface is that of its cells, which hold what the motion leaves.
+    covariance = np.zeros((STATE, STATE)) if is_curved else contribution(gain, one, fit)
     if one.by_radius is not None:
         covariance[6, 6] += (RADIUS_PX * px_mm) ** 2 + FORM_MM**2
-    if is_curved:  # the noise of its cells, which hold what the motion leaves, is that of both
-        covariance[:] = 0.0
     state = gain @ one.offsets_mm
     across = point_from_move(places - center)[:, :, :6] @ state[:6]
     in_plane = orthogonal_complement(axis[None]).T

@@ -41,8 +41,11 @@ def _bar(one: CharacteristicResult) -> dict[str, float] | None:
     places = [one.value_mm - one.uncertainty_mm, one.value_mm + one.uncertainty_mm, one.value_mm]
     places += [place for place in (low, high, 0.0 if one.zone_mm is not None else None) if place is not None]
     start, length = min(places), max(max(places) - min(places), 1e-9)
-    shares = [6.0 + 88.0 * (place - start) / length for place in places]
-    limits = [None if limit is None else 6.0 + 88.0 * (limit - start) / length for limit in (low, high)]
+    shares = {place: 6.0 + 88.0 * (place - start) / length for place in places}
     return {
-        "low": limits[0] or 0.0, "high": limits[1] or 100.0, "from": shares[0], "to": shares[1], "at": shares[2],
-    }  # fmt: skip
+        "low": 0.0 if low is None else shares[low],
+        "high": 100.0 if high is None else shares[high],
+        "from": shares[places[0]],
+        "to": shares[places[1]],
+        "at": shares[places[2]],
+    }

@@ -21,7 +21,7 @@ from arview.measurement.datums.equations import (
     move_equations,
     surface_equations,
 )
-from arview.measurement.datums.options import CLEAR_MM, MIN_CLEAR_MM, POINT_RADIUS_MM, REACH_MM
+from arview.measurement.datums.options import CLEAR_MM, CORRELATED_POINTS, MIN_CLEAR_MM, POINT_RADIUS_MM, REACH_MM
 from arview.measurement.photo.patches import near_others
 from arview.measurement.types import Move
 from arview.reconstruction import DenseCloud
@@ -34,8 +34,6 @@ _MAX_POINTS = 1500
 """Points of a feature that are used; errors of denser points are correlated."""
 _MIN_POINTS = 12
 """Points that a feature needs."""
-_CORRELATED_POINTS = 10.0
-"""Neighbouring points whose errors count as one."""
 _EDGE_BAND_MM = (2.0, 15.0)
 """Distances from an edge between which its faces are used: beyond the rounding, but not as far as their other end."""
 
@@ -167,7 +165,7 @@ def _measure_edge(datum: Datum, model: Model, cloud: CloudPoints) -> DatumEquati
         factor = max(1.0, float((share * residuals**2 / variances).sum() / max(1.0, share.sum() - 3.0)))
         # Errors of neighbouring points are correlated over some millimetres.
         # They count as one in ten points of the grid.
-        spread = _CORRELATED_POINTS * factor * np.sum((at @ solver) ** 2 * variances, axis=1)
+        spread = CORRELATED_POINTS * factor * np.sum((at @ solver) ** 2 * variances, axis=1)
         parts.append((at @ (solver @ offsets[band]), spread, np.tile(normal, (2, 1))))
     offsets, variances, normals = (np.concatenate(column) for column in zip(*parts, strict=True))
     return surface_equations(

@@ -88,12 +88,12 @@ def measure_plane_in_photos(
     Raises:
         DatumNotMeasuredError: neither shows it.
     """
+    if datum.targets_in_model:
+        return [_measure_flat(datum, views)]
     ways: tuple[Callable[[], DatumEquations], ...] = (
         lambda: _measure_flat(datum, views),
         lambda: measure_plane_by_edges(datum, views, moves.get(datum.component)),
     )
-    if datum.targets_in_model:
-        return [_measure_flat(datum, views)]
     found: list[DatumEquations] = []
     faults: list[DatumNotMeasuredError] = []
     for way in ways:

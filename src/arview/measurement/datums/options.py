@@ -10,3 +10,5 @@ POINT_RADIUS_MM = 4.0
 """Radius of the disc around a datum point that is measured; a few patches."""
 REACH_MM = 1.0
 """Largest distance of a feature from its rough place."""
+CORRELATED_POINTS = 10.0
+"""Neighbouring points whose errors count as one."""
