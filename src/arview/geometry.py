@@ -138,13 +138,6 @@ def turns_to_rays(rays: Array) -> Array:
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
-def rolls_between(a: Array, b: Array) -> Array:
-    """Angles in rad about +Z that, after rotations ``a`` (..., 3,3), come nearest to rotations ``b``."""
-    # The largest trace of Rz(roll) a bᵀ.
-    between = b @ np.swapaxes(a, -1, -2)
-    return np.asarray(np.arctan2(between[..., 1, 0] - between[..., 0, 1], between[..., 0, 0] + between[..., 1, 1]))
-
-
 def orthonormalise(b_from_a: Array) -> Array:
     """Nearest rigid transform: the rotation block is projected onto SO(3) by SVD."""
     u, _, vt = np.linalg.svd(b_from_a[:3, :3])

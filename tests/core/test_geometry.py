@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from arview.camera import Camera
+from arview.detection.search.template_bank import rolls_between
 from arview.errors import InputError
 from arview.geometry import (
     apply,
@@ -20,7 +21,6 @@ from arview.geometry import (
     look_at,
     orthonormalise,
     rigid,
-    rolls_between,
     rotation_angle_rad,
     turn_ball,
     turns_to_rays,

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from arview.cad.part_file import part_from_text as part_from_text
     from arview.cad.picking import PickedFeature as PickedFeature
     from arview.cad.picking import pick_features as pick_features
+    from arview.cad.picking import smooth_faces as smooth_faces
     from arview.cad.pmi_proposal import propose_part as propose_part
     from arview.cad.samples import Samples as Samples
     from arview.cad.samples import sample_surface as sample_surface
@@ -90,6 +91,7 @@ __getattr__, __dir__, __all__ = lazy_door(
         "picking": (
             "PickedFeature",
             "pick_features",
+            "smooth_faces",
         ),
         "samples": (
             "Samples",

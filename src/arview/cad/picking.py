@@ -86,6 +86,12 @@ def pick_features(component: Component, face: int, point_in_model: Array) -> lis
     return found
 
 
+def smooth_faces(component: Component, face: int) -> NDArray[np.int64]:
+    """Indices of the faces that are joined with one without a sharp edge."""
+    faces = component.faces.astype(np.int64)
+    return _region(face, _neighbours(faces), _normals(component.vertices_in_model, faces), SMOOTH_DEG, None)
+
+
 def _normals(vertices: Array, faces: NDArray[np.int64]) -> Array:
     """(F,3) unit normals."""
     a, b, c = vertices[faces].transpose(1, 0, 2)

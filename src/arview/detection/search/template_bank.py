@@ -18,7 +18,7 @@ from arview.cad import ViewRange
 from arview.core.kernel import kernel
 from arview.detection.features.response_maps import orientation_bins
 from arview.errors import InputError
-from arview.geometry import Array, rolls_between
+from arview.geometry import Array
 from arview.guideviews import GuideViewSet, ViewFeatures, icosphere_directions, view_lines
 from arview.refinement import project_lines
 from arview.rendering import EDGE_CONTOUR
@@ -43,6 +43,13 @@ SUBDIVISIONS = 4
 """Icosahedron level of the directions that have an outline (4: 2,562, about 4° apart)."""
 FAR_DEG = 8.5
 """Angle to the far neighbours of a direction, about twice the spacing of the directions."""
+
+
+def rolls_between(a: Array, b: Array) -> Array:
+    """Angles in rad about +Z that, after rotations ``a`` (..., 3,3), come nearest to rotations ``b``."""
+    # The largest trace of Rz(roll) a bᵀ.
+    between = b @ np.swapaxes(a, -1, -2)
+    return np.asarray(np.arctan2(between[..., 1, 0] - between[..., 0, 1], between[..., 0, 0] + between[..., 1, 1]))
 
 
 @dataclass(frozen=True)

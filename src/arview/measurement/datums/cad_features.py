@@ -6,10 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
-from arview.cad import Component, Datum, edge_faces, find_rims
+from arview.cad import Component, Datum, find_rims, smooth_faces
 from arview.errors import InputError
 from arview.geometry import Array, from_segment
 from arview.measurement.cloud.mesh_surface import MeshSurface
@@ -17,8 +15,6 @@ from arview.measurement.datums.options import REACH_MM
 
 _TOLERANCE_MM = 0.05
 """Largest distance of a vertex from the plane, cylinder or line to which it belongs."""
-SHARP_DEG = 25.0
-"""Angle between faces from which their common edge bounds a surface."""
 
 
 def _faces(component: Component) -> tuple[Array, Array]:
@@ -104,13 +100,9 @@ def surface_faces(component: Component, datum: Datum) -> NDArray[np.bool_]:
         raise InputError(
             f"datum {datum.label}: {list(datum.point_in_model)} is not on the surface of {datum.component!r}"
         )
-    edges, normals = edge_faces(component.faces), surface.face_normals
-    joined = edges.faces[edges.face_count == 2]
-    is_smooth = np.einsum("ex,ex->e", *normals[joined.T]) > np.cos(np.deg2rad(SHARP_DEG))
-    first, second = joined[is_smooth].T
-    size = (len(normals), len(normals))
-    _, labels = connected_components(coo_matrix((np.ones(len(first)), (first, second)), shape=size), directed=False)
-    return np.asarray(labels == labels[start])
+    found = np.zeros(len(component.faces), dtype=bool)
+    found[smooth_faces(component, int(start))] = True
+    return found
 
 
 @dataclass(frozen=True)
