@@ -237,10 +237,10 @@ def test_double_tap_and_pinch(chromium: Any, station: Running) -> None:
     with opened(chromium, station, has_touch=True, viewport=ROOMY) as page:
         until(page, TRACKED)
         whole_px = page.evaluate(width)
-        page.mouse.dblclick(300, 300)
+        page.mouse.dblclick(*page.evaluate(FREE_POINT))  # a tap on a label chooses its component
         until(page, f"{width} > {2 * whole_px}")
         assert page.locator("#card").is_hidden(), "the first of two taps chose a component"
-        page.mouse.dblclick(*page.evaluate(FREE_POINT))  # a tap on a label chooses its component
+        page.mouse.dblclick(*page.evaluate(FREE_POINT))
         until(page, f"Math.abs({width} - {whole_px}) < 2")
         session = page.context.new_cdp_session(page)
         for kind, apart in (("touchStart", 40), ("touchMove", 60), ("touchMove", 100), ("touchEnd", None)):

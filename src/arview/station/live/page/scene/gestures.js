@@ -74,7 +74,9 @@ export class Gestures {
 
   #click(event) {
     const [x, y] = this.#at(event), { ms } = this.#tap;
-    const isDouble = event.timeStamp - ms < DOUBLE_MS && Math.hypot(x - this.#tap.x, y - this.#tap.y) < DOUBLE_PX;
+    // The browser counts clicks by the user's own double-click time; some count no taps, and so they are timed here, too.
+    const isSoon = event.timeStamp - ms < DOUBLE_MS && Math.hypot(x - this.#tap.x, y - this.#tap.y) < DOUBLE_PX;
+    const isDouble = isSoon || (event.detail > 1 && event.detail % 2 === 0);
     this.#tap = { ms: isDouble ? -Infinity : event.timeStamp, x, y };
     if (!isDouble) return this.events.onTap(event);
     this.events.onDouble();
