@@ -187,7 +187,7 @@ def measure_all(
             tell("components", round(share * len(names)), len(names))
 
         if not known:
-            known.update(measure_components_in_photos(views, part, part.model, step, names))
+            known.update(measure_components_in_photos(views, part, part.model, step, names, options.methods))
         for name, by_method in known.items():
             found[name] += [by_method[method] for method in options.methods if method in by_method]
     if "cloud" in options.methods and reconstruction.cloud is not None:

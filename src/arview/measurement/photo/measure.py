@@ -47,6 +47,7 @@ def measure_components_in_photos(
     model: Model,
     progress: Callable[[str, float], None] | None = None,
     names: Sequence[str] | None = None,
+    methods: Sequence[Method] = ("sweep", "edges"),
 ) -> dict[str, MethodResults]:
     """Measure where components are, by each of the two methods.
 
@@ -59,6 +60,7 @@ def measure_components_in_photos(
         model: the nominal CAD.
         progress: called with the name of a finished component and the share that is done.
         names: components to measure; default: those inspected.
+        methods: without "sweep", only what the edges do not find is also measured by its surface.
 
     Raises:
         InputError: there are fewer than three photos, photos cannot be read, a component does not exist, or the poses
@@ -71,7 +73,7 @@ def measure_components_in_photos(
         names = names or [name for name in part.inspected if name in known] if part is not None else names
     indices = [model.index(name) for name in names]
     results: dict[str, MethodResults] = {}
-    jobs = [(index, pool().submit(measure_component, views, index, part)) for index in indices]
+    jobs = [(index, pool().submit(measure_component, views, index, part, methods)) for index in indices]
     for done, (index, job) in enumerate(jobs, 1):
         name = model.components[index].name
         results[name] = job.result()
@@ -107,10 +109,14 @@ def _absent_if_no_edges(found: MethodResults, results: Mapping[str, MethodResult
     }
 
 
-def measure_component(views: PhotoViews, index: int, part: Part | None) -> MethodResults:
+def measure_component(
+    views: PhotoViews, index: int, part: Part | None, methods: Sequence[Method] = ("sweep", "edges")
+) -> MethodResults:
     """Measure one component by both methods; if the edges fail, check whether the component is missing."""
     body = MeasuredComponent(views, index, part)
     edges = _by_edges(body)
+    if "sweep" not in methods and isinstance(edges, Move):
+        return {"edges": edges}
     # The place found by edges is one more start of the sweep; the sweep's result there remains independent.
     sweep = ComponentSweep(body).measure([edges.measured_from_nominal] if isinstance(edges, Move) else [])
     if isinstance(edges, NotMeasured) and isinstance(sweep, Move):

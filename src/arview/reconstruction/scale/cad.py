@@ -53,6 +53,8 @@ CLEAR_SUPPORT = 0.6
 """Support of a component that is seen as it should be …."""
 MIN_CLEAR = 2
 """… and number of such components with which a part is accepted of which the rest is hidden."""
+SAME_SUPPORT = 0.8
+"""Share of the last part's support that the next one must have to lie where the last one lay."""
 CLEAR_LEAD = 0.08
 """An alternative whose support is less than this below the best one's makes the frame ambiguous."""
 
@@ -82,6 +84,7 @@ class CadFind:
         refiner: with the views to which it was fitted.
         detail: description for the evidence.
         warnings: messages about doubts.
+        turns: (N,3,3) rotations under which the part looks similar.
     """
 
     fit: Fit
@@ -89,6 +92,7 @@ class CadFind:
     refiner: JointRefiner
     detail: str
     warnings: tuple[str, ...]
+    turns: Array
 
 
 @dataclass(frozen=True)
@@ -169,6 +173,7 @@ def find_cad(
     part: Part,
     options: CadOptions,
     progress: Progress | None = None,
+    before: CadFind | None = None,
 ) -> CadFind | NotFound:
     """Find the similarity that fits the CAD to the photos.
 
@@ -178,6 +183,7 @@ def find_cad(
         part: the part to find.
         options: see `CadOptions`.
         progress: called with (what, done, total).
+        before: where fixed cameras found the last part: if this one lies there as well, nothing is searched for.
 
     Returns:
         The CAD as found, or why it was not found.
@@ -186,6 +192,13 @@ def find_cad(
         return NotFound("fewer than two photos were placed")
     order = spread_order(photos)
     reasons: list[NotFound] = []
+    if before is not None:
+        last = [Vote(before.fit.similarity, (), 1.0)]
+        found = _refined(
+            photos, order, read, part=part, votes=last, turns=before.turns, options=options, progress=progress
+        )
+        if isinstance(found, CadFind) and found.support.score > SAME_SUPPORT * before.support.score:
+            return found
     for view_range in search_ranges(part, [photo.camera for photo in photos], SPANS):
         views = cached_guide_views(
             part.model,
@@ -308,7 +321,7 @@ def _refined(
         f"CAD edges in {len(views)} photos, with {', '.join(base)} at nominal: "
         f"{100 * support.share:.0f} % found, {fit.sigma_px:.2f} px"
     )
-    return CadFind(fit, support, refiner, detail, tuple(warnings))
+    return CadFind(fit, support, refiner, detail, tuple(warnings), turns)
 
 
 def _turned(similarity: Similarity, turn: Array, model: Model) -> Similarity:

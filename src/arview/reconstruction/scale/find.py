@@ -64,7 +64,7 @@ def find_scale(
         InputError: a photo cannot be read.
     """
     sources = sources or ScaleSources()
-    read = read or _read_file
+    read = read or read_file
     evidence, missing = scale_from_targets(
         sparse.photos, lambda photo: np.asarray(cv2.cvtColor(read(photo), cv2.COLOR_RGB2GRAY)), sources
     )
@@ -74,11 +74,22 @@ def find_scale(
     found: CadFind | NotFound = NotFound("no part was given")
     if part is not None:
         found = find_cad(sparse.photos, read, part, options or CadOptions(), progress)
+    return scale_of_cad(sparse, part, found, evidence, missing)
+
+
+def scale_of_cad(
+    sparse: SparseModel,
+    part: Part | None,
+    found: CadFind | NotFound,
+    evidence: Sequence[ScaleEvidence],
+    remarks: Sequence[str],
+) -> ScaleResult:
+    """Scale and frame by the CAD as it was found, and by other evidence; ``remarks`` come before other warnings."""
     if isinstance(found, CadFind):
         std = float(np.sqrt(found.fit.covariance[6, 6]))
-        evidence.append(ScaleEvidence("cad", found.fit.similarity.scale, std, found.detail))
+        evidence = [*evidence, ScaleEvidence("cad", found.fit.similarity.scale, std, found.detail)]
     combined = combine(evidence)
-    warnings = [*missing, *(combined.warnings if combined else ())]
+    warnings = [*remarks, *(combined.warnings if combined else ())]
     if isinstance(found, NotFound) or combined is None or part is None:
         no_fit = NotFound("") if isinstance(found, CadFind) else found
         consistency = Consistency(False, no_fit.reason) if no_fit.is_contradiction else NO_CHECK
@@ -154,7 +165,7 @@ def combine(evidence: Sequence[ScaleEvidence]) -> CombinedScale | None:
     return CombinedScale(float(np.exp(mean)), std, tuple(checked), tuple(warnings))
 
 
-def _read_file(photo: PosedPhoto) -> NDArray[np.uint8]:
+def read_file(photo: PosedPhoto) -> NDArray[np.uint8]:
     """The picture of a photo, from its file."""
     from arview.reconstruction.intake.reading import read_photo
 

@@ -137,6 +137,10 @@ class CadEdgePoints:
     component: NDArray[np.int32]
     feature: NDArray[np.int64]
 
+    def of(self, which: NDArray[np.bool_]) -> CadEdgePoints:
+        """The chosen points."""
+        return CadEdgePoints(self.points[which], self.tangents[which], self.component[which], self.feature[which])
+
 
 @dataclass(frozen=True)
 class EdgeResiduals:
@@ -161,7 +165,7 @@ class JointRefiner:
     """Refines similarities of one model in some views."""
 
     def __init__(self, model: Model, base: Sequence[str], views: Sequence[ScaleView]) -> None:
-        self.model = model
+        self.model, self.base = model, tuple(base)
         self.views = tuple(views)
         self.center = model.center_in_model
         self._edges = mesh_edges(model)
@@ -310,10 +314,7 @@ class JointRefiner:
 
         def one(view: ScaleView) -> CadEdgePoints:
             found = self.samples(view, start.cam_from_model(view.cam_from_scan))
-            if components is None:
-                return found
-            of = components[found.component]
-            return CadEdgePoints(found.points[of], found.tangents[of], found.component[of], found.feature[of])
+            return found if components is None else found.of(components[found.component])
 
         return list(pool().map(one, self.views))
 

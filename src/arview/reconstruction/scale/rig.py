@@ -1,0 +1,199 @@
+"""A part under fixed cameras whose poses are known in mm, and which of these cameras is no longer where it was.
+
+Each camera is asked alone where it sees the part's edges. While they do not agree, the one is left
+out without which the others agree best.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from math import inf
+
+import numpy as np
+from numpy.typing import NDArray
+
+from arview.cad import Part
+from arview.core.fits import robust_sigma, tukey_weights
+from arview.geometry import Array, apply, exp_se3, invert, log_se3, rigid
+from arview.reconstruction.scale.cad import CadFind, CadOptions, NotFound, find_cad, make_view
+from arview.reconstruction.scale.find import read_file, scale_of_cad
+from arview.reconstruction.scale.refine import JointRefiner, ScaleView
+from arview.reconstruction.scale.types import ScaleEvidence, ScaleResult
+from arview.reconstruction.types import PosedPhoto, SparseModel
+
+MOVED_PX = 0.35
+"""Shift of the edges from which a camera has moved; shadows and rounded edges shift them by less."""
+CHECK_REACHES_PX = (9.0, 5.0, 3.0, 3.0)
+"""Search range across the edges in each round of looking where a camera sees the base."""
+MIN_EDGE_POINTS = 40
+"""Edge points that say where a camera sees the part."""
+MIN_SHARE = 0.4
+"""Share of the edges that a camera must show, and of the median camera's share beyond chance."""
+MIN_LEFT = 2
+"""Cameras that must agree for another one to have moved."""
+_DAMPING = np.repeat([1e4, 1.0], 3)
+"""Inverse variances of a camera's error before it is looked at: 10 mrad and 1 mm at the part, 1/rad² and 1/mm²."""
+
+
+@dataclass(frozen=True)
+class CameraShift:
+    """Where one camera sees the part, compared with where the others have it.
+
+    Attributes:
+        name: of the camera.
+        shift_px: root mean square shift of the edges in its picture; None: it does not show them.
+        model_twist: (6,) rad and mm by which the part would have to move, about its centre, to be where it sees it.
+        covariance: (6,6) of ``model_twist``.
+    """
+
+    name: str
+    shift_px: float | None
+    model_twist: Array
+    covariance: Array
+
+
+@dataclass(frozen=True)
+class RigPlacement:
+    """A part under a rig.
+
+    Attributes:
+        scale: scale and frame, with a warning for each camera that has moved.
+        found: the fit, from which the next part is found faster; None: the part was not found.
+        moved: cameras that are not where they were calibrated, or whose picture does not show the part.
+        shifts: of all cameras.
+    """
+
+    scale: ScaleResult
+    found: CadFind | None
+    moved: tuple[CameraShift, ...] = ()
+    shifts: tuple[CameraShift, ...] = ()
+
+
+def place_on_rig(
+    sparse: SparseModel,
+    part: Part,
+    known: ScaleEvidence,
+    before: RigPlacement | None = None,
+    read: Callable[[PosedPhoto], NDArray[np.uint8]] | None = None,
+) -> RigPlacement:
+    """Where a part lies under a rig, by the cameras that agree.
+
+    Args:
+        sparse: one photo for each camera, with its calibrated pose in mm; no points.
+        part: to be found.
+        known: the scale of the rig: 1 and its relative standard deviation.
+        before: the last part, from which this one is found faster.
+        read: returns the upright (H,W,3) uint8 RGB picture of a photo; default: from its file.
+    """
+    read = read or read_file
+    found = _found(sparse.photos, read, part, before)
+    if not isinstance(found, CadFind):
+        return RigPlacement(scale_of_cad(sparse, part, found, [known], []), None)
+    kept, moved, shifts = without_moved(found)
+    left = {view.name for view in kept.refiner.views}
+    agreeing = replace(sparse, photos=tuple(photo for photo in sparse.photos if photo.name in left))
+    warnings = [_moved_text(one) for one in moved]
+    return RigPlacement(scale_of_cad(agreeing, part, kept, [known], warnings), kept, moved, shifts)
+
+
+def _found(
+    photos: Sequence[PosedPhoto],
+    read: Callable[[PosedPhoto], NDArray[np.uint8]],
+    part: Part,
+    before: RigPlacement | None,
+) -> CadFind | NotFound:
+    """The part by all cameras; if these contradict each other, by all but those that had moved, or but one."""
+    last = None if before is None else before.found
+    found = find_cad(photos, read, part, CadOptions(), before=last)
+    suspects = [{one.name for one in before.moved}] if before is not None and before.moved else []
+    for out in [*suspects, *({photo.name} for photo in photos)]:
+        some = [photo for photo in photos if photo.name not in out]
+        if isinstance(found, CadFind) or not found.is_contradiction or len(some) < MIN_LEFT:
+            break
+        found = find_cad(some, read, part, CadOptions(), before=last)
+    if not isinstance(found, CadFind) or len(found.refiner.views) == len(photos):
+        return found
+    views = [make_view(photo, read(photo), CadOptions().max_side_px) for photo in photos]
+    refiner = JointRefiner(part.model, found.refiner.base, views)
+    return replace(found, refiner=refiner, support=refiner.support(found.fit.similarity))
+
+
+def without_moved(found: CadFind) -> tuple[CadFind, tuple[CameraShift, ...], tuple[CameraShift, ...]]:
+    """The fit to the cameras that agree, those that do not, and what all of them see."""
+    views, shares = found.refiner.views, found.support.by_view
+    usual = float(np.nanmedian(shares))
+    blind = {view.name for view, share in zip(views, shares, strict=True) if not share >= MIN_SHARE * usual}
+    kept = found
+    if blind and len(views) - len(blind) >= MIN_LEFT:
+        kept = _fitted(found, [view for view in views if view.name not in blind])
+    order = _by_shift(kept)
+    while order[0][0] >= MOVED_PX and len(order) > MIN_LEFT:
+        fewer = []
+        for _, name in order:
+            fit = _fitted(kept, [view for view in kept.refiner.views if view.name != name])
+            fewer.append((_by_shift(fit), fit))
+            if fewer[-1][0][0][0] < MOVED_PX:
+                break
+        order, kept = min(fewer, key=lambda one: one[0][0][0])
+    shifts = tuple(camera_shift(kept, view) for view in views)
+    left = {view.name for view in kept.refiner.views}
+    # Two cameras that contradict each other do not say which of them has moved.
+    if any(one.shift_px is None or one.shift_px >= MOVED_PX for one in shifts if one.name in left):
+        return kept, shifts, shifts
+    return kept, tuple(one for one in shifts if one.name not in left), shifts
+
+
+def _by_shift(found: CadFind) -> list[tuple[float, str]]:
+    """Shift in px and name of each camera, the largest first; infinite where the picture does not show the part."""
+    shifts = (camera_shift(found, view) for view in found.refiner.views)
+    return sorted(((inf if one.shift_px is None else one.shift_px, one.name) for one in shifts), reverse=True)
+
+
+def _fitted(found: CadFind, views: list[ScaleView]) -> CadFind:
+    """The fit to some of the views."""
+    refiner = JointRefiner(found.refiner.model, found.refiner.base, views)
+    fit = refiner.refine(found.fit.similarity)
+    return replace(found, fit=fit, support=refiner.support(fit.similarity, fit.samples), refiner=refiner)
+
+
+def camera_shift(found: CadFind, view: ScaleView) -> CameraShift:
+    """Where a camera alone sees the part, with each component where all cameras together have it.
+
+    The components are taken along because the edges of the base are often hidden, and then leave directions free.
+    """
+    refiner, similarity, center = found.refiner, found.fit.similarity, found.refiner.center
+    pose = similarity.cam_from_model(view.cam_from_scan)
+    nominal = refiner.samples(view, pose)
+    samples = replace(nominal, points=nominal.points + found.fit.displacements_mm[nominal.component])
+    none = CameraShift(view.name, None, np.zeros(6), np.diag(1.0 / _DAMPING))
+    total, covariance = np.eye(4), np.zeros((7, 7))
+    for reach_px in CHECK_REACHES_PX:
+        measured = refiner.measure(view, samples, pose @ _about(total, center), reach_px)
+        if len(measured.offsets) < MIN_EDGE_POINTS:
+            return none
+        sigma_px = max(0.3, robust_sigma(measured.offsets - np.median(measured.offsets)))
+        weights = tukey_weights(measured.offsets / (2.0 * sigma_px)) / sigma_px**2
+        rows = np.delete(measured.rows, 6, axis=1)  # the scale is that of the rig
+        hessian = (rows * weights[:, None]).T @ rows
+        hessian += np.diag([*_DAMPING, 100.0])  # a common shift of all edges to the dark side: 0.1 px
+        covariance = np.linalg.inv(hessian)
+        total = total @ exp_se3((covariance @ (rows.T @ (weights * measured.offsets)))[:6])
+    if measured.found.sum() < MIN_SHARE * measured.searched.sum():
+        return none
+    before, after = (view.camera.project(apply(at, samples.points)) for at in (pose, pose @ _about(total, center)))
+    shift_px = float(np.sqrt(np.nanmean(np.sum((after - before) ** 2, axis=1))))
+    return CameraShift(view.name, shift_px, log_se3(total), covariance[:6, :6] * 25.0)
+
+
+def _about(motion: Array, center: Array) -> Array:
+    """A motion (4,4) about a point of the model."""
+    to_center = rigid(np.eye(3), center)
+    return np.asarray(to_center @ motion @ invert(to_center))
+
+
+def _moved_text(shift: CameraShift) -> str:
+    """What is said of a camera that has moved."""
+    if shift.shift_px is None:
+        return f"camera {shift.name}: does not show the part where the other cameras have it: covered, or moved far"
+    return f"camera {shift.name} has moved: it sees the part {shift.shift_px:.1f} px from where the others have it"
