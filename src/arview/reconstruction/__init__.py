@@ -52,6 +52,9 @@ if TYPE_CHECKING:
     from arview.reconstruction.scale.cad import search_ranges as search_ranges
     from arview.reconstruction.scale.cad import shrunk as shrunk
     from arview.reconstruction.scale.find import find_scale as find_scale
+    from arview.reconstruction.scale.rig import RigPlacement as RigPlacement
+    from arview.reconstruction.scale.rig import cameras_from_part as cameras_from_part
+    from arview.reconstruction.scale.rig import place_on_rig as place_on_rig
     from arview.reconstruction.scale.similarity import Similarity as Similarity
     from arview.reconstruction.scale.specs import ScaleSources as ScaleSources
     from arview.reconstruction.scale.specs import load_rig as load_rig
@@ -137,6 +140,11 @@ __getattr__, __dir__, __all__ = lazy_door(
             "shrunk",
         ),
         "scale.find": ("find_scale",),
+        "scale.rig": (
+            "RigPlacement",
+            "cameras_from_part",
+            "place_on_rig",
+        ),
         "scale.similarity": ("Similarity",),
         "scale.specs": (
             "ScaleSources",

@@ -6,19 +6,38 @@ out without which the others agree best.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import inf
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from arview.cad import Part
+from arview.camera import Camera
 from arview.core.fits import robust_sigma, tukey_weights
-from arview.geometry import Array, apply, exp_se3, invert, log_se3, rigid
-from arview.reconstruction.scale.cad import CadFind, CadOptions, NotFound, find_cad, make_view
+from arview.errors import InputError
+from arview.geometry import Array, apply, exp_se3, invert, log_se3, orthonormalise, rigid, skew
+from arview.guideviews import GuideViewOptions, cached_guide_views
+from arview.reconstruction.intake.reading import read_photo
+from arview.reconstruction.scale.cad import (
+    DETECT_WIDTH_PX,
+    FOUND_QUALITY,
+    SPANS,
+    SUBDIVISIONS,
+    CadFind,
+    CadOptions,
+    NotFound,
+    base_names,
+    find_cad,
+    make_view,
+    search_ranges,
+    shrunk,
+)
 from arview.reconstruction.scale.find import read_file, scale_of_cad
 from arview.reconstruction.scale.refine import JointRefiner, ScaleView
+from arview.reconstruction.scale.similarity import Similarity
 from arview.reconstruction.scale.types import ScaleEvidence, ScaleResult
 from arview.reconstruction.types import PosedPhoto, SparseModel
 
@@ -30,6 +49,8 @@ MIN_EDGE_POINTS = 40
 """Edge points that say where a camera sees the part."""
 MIN_SHARE = 0.4
 """Share of the edges that a camera must show, and of the median camera's share beyond chance."""
+RIG_ROUNDS = 3
+"""Rounds in which cameras are placed by the part; the components' displacements settle with them."""
 MIN_LEFT = 2
 """Cameras that must agree for another one to have moved."""
 _DAMPING = np.repeat([1e4, 1.0], 3)
@@ -167,7 +188,7 @@ def camera_shift(found: CadFind, view: ScaleView) -> CameraShift:
     nominal = refiner.samples(view, pose)
     samples = replace(nominal, points=nominal.points + found.fit.displacements_mm[nominal.component])
     none = CameraShift(view.name, None, np.zeros(6), np.diag(1.0 / _DAMPING))
-    total, covariance = np.eye(4), np.zeros((7, 7))
+    total, covariance = np.eye(4), none.covariance
     for reach_px in CHECK_REACHES_PX:
         measured = refiner.measure(view, samples, pose @ _about(total, center), reach_px)
         if len(measured.offsets) < MIN_EDGE_POINTS:
@@ -177,13 +198,108 @@ def camera_shift(found: CadFind, view: ScaleView) -> CameraShift:
         rows = np.delete(measured.rows, 6, axis=1)  # the scale is that of the rig
         hessian = (rows * weights[:, None]).T @ rows
         hessian += np.diag([*_DAMPING, 100.0])  # a common shift of all edges to the dark side: 0.1 px
-        covariance = np.linalg.inv(hessian)
+        covariance = np.asarray(np.linalg.inv(hessian))
         total = total @ exp_se3((covariance @ (rows.T @ (weights * measured.offsets)))[:6])
     if measured.found.sum() < MIN_SHARE * measured.searched.sum():
         return none
     before, after = (view.camera.project(apply(at, samples.points)) for at in (pose, pose @ _about(total, center)))
     shift_px = float(np.sqrt(np.nanmean(np.sum((after - before) ** 2, axis=1))))
     return CameraShift(view.name, shift_px, log_se3(total), covariance[:6, :6] * 25.0)
+
+
+@dataclass(frozen=True)
+class CamerasFromPart:
+    """Fixed cameras placed by the part that they see, in the frame of the model.
+
+    Attributes:
+        cams_from_rig: (M,4,4) mm.
+        covariance: (6M,6M) of their left twists.
+        scale_std: relative standard uncertainty of lengths.
+        residuals_px: of each camera: mean shift of the part's edges over the shots.
+    """
+
+    cams_from_rig: Array
+    covariance: Array
+    scale_std: float
+    residuals_px: tuple[float, ...]
+
+
+def cameras_from_part(
+    shots: Sequence[Mapping[str, Path]], cameras: Mapping[str, Camera], part: Part
+) -> CamerasFromPart:
+    """Place fixed cameras by the part: in the first shot by its pose in each picture, then by its edges in all shots.
+
+    Args:
+        shots: the picture of each camera; the part may lie at another place in each.
+        cameras: their intrinsics.
+        part: that they see.
+
+    Raises:
+        InputError: a picture does not show the part where the others have it, or the part is not found.
+    """
+    names = tuple(cameras)
+    poses = {name: _pose_of_part(shots[0][name], cameras[name], part, name) for name in names}
+    covariance = np.zeros((6 * len(names), 6 * len(names)))
+    scale_std = 0.0
+    residuals = dict.fromkeys(names, 0.0)
+    for _ in range(RIG_ROUNDS):
+        information = {name: np.zeros((6, 6)) for name in names}
+        pulls = {name: np.zeros(6) for name in names}
+        residuals = dict.fromkeys(names, 0.0)
+        for number, shot in enumerate(shots):
+            photos = [PosedPhoto(name, shot[name], cameras[name], poses[name]) for name in names]
+            found = _fit_of_shot(photos, part, is_first=number == 0)
+            scale_std = float(np.sqrt(found.fit.covariance[6, 6]))
+            for view in found.refiner.views:
+                shift = camera_shift(found, view)
+                if shift.shift_px is None:
+                    raise InputError(f"{shot[view.name]}: does not show the part where the other cameras have it")
+                turned = _adjoint(found.fit.similarity.cam_from_model(view.cam_from_scan), found.refiner.center)
+                own = np.linalg.inv(turned @ shift.covariance @ turned.T)
+                information[view.name] += own
+                pulls[view.name] += own @ (turned @ shift.model_twist)
+                residuals[view.name] += shift.shift_px / len(shots)
+        for m, name in enumerate(names):
+            covariance[6 * m : 6 * m + 6, 6 * m : 6 * m + 6] = np.linalg.inv(information[name])
+            poses[name] = orthonormalise(exp_se3(np.linalg.solve(information[name], pulls[name])) @ poses[name])
+    return CamerasFromPart(
+        np.array([poses[name] for name in names]), covariance, scale_std, tuple(residuals[name] for name in names)
+    )
+
+
+def _pose_of_part(path: Path, camera: Camera, part: Part, name: str) -> Array:
+    """``cam_from_model`` of the part in one picture."""
+    from arview.detection import Detector
+
+    small, image = shrunk(camera, read_photo(path), DETECT_WIDTH_PX)
+    for view_range in search_ranges(part, [camera], SPANS):
+        views = cached_guide_views(part.model, view_range, GuideViewOptions(subdivisions=SUBDIVISIONS))
+        found = Detector(views, small).detect(image, 1)
+        if found and found[0].quality >= FOUND_QUALITY:
+            return found[0].cam_from_model
+    raise InputError(f"{path}: the part is not found in the picture of the camera {name}")
+
+
+def _fit_of_shot(photos: Sequence[PosedPhoto], part: Part, is_first: bool) -> CadFind:
+    """The part in one shot; in the first one it lies where the rig's frame is."""
+    if is_first:
+        views = [make_view(photo, read_file(photo), CadOptions().max_side_px) for photo in photos]
+        refiner = JointRefiner(part.model, base_names(part), views)
+        fit = refiner.refine(Similarity(1.0, np.eye(4)))
+        return CadFind(fit, refiner.support(fit.similarity), refiner, "", (), np.zeros((0, 3, 3)))
+    found = find_cad(photos, read_file, part, CadOptions())
+    if isinstance(found, NotFound):
+        raise InputError(f"{photos[0].path}: the part is not found in this shot: {found.reason}")
+    return found
+
+
+def _adjoint(cam_from_model: Array, center: Array) -> Array:
+    """(6,6) from a twist about the model's centre, right of a pose, to the same twist left of it."""
+    rotation, shift = cam_from_model[:3, :3], apply(cam_from_model, center)
+    result = np.zeros((6, 6))
+    result[:3, :3] = result[3:, 3:] = rotation
+    result[3:, :3] = skew(shift) @ rotation
+    return result
 
 
 def _about(motion: Array, center: Array) -> Array:
