@@ -19,6 +19,7 @@ from arview.cli import (
     measure,
     reconstruct,
     report,
+    station,
     verify,
     warmup,
 )
@@ -44,6 +45,7 @@ __all__ = [
     "measure",
     "reconstruct",
     "report",
+    "station",
     "verify",
     "warmup",
 ]

@@ -36,7 +36,7 @@ _STORAGE_ERRORS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROF
 
 
 SECTIONS = {
-    "Inspect": ("inspect", "annotate", "live", "measure", "reconstruct", "capture", "batch"),
+    "Inspect": ("inspect", "annotate", "live", "station", "measure", "reconstruct", "capture", "batch"),
     "Set up": ("check", "studio", "guideviews", "calibrate", "verify"),
     "Record": ("report", "export", "rework", "decisions", "history", "inspection", "compare"),
 }

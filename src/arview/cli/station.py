@@ -1,0 +1,192 @@
+"""The commands station calibrate, check and run: a cell of fixed cameras."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from pathlib import Path
+
+import click
+
+from arview import calibration
+from arview.cli.common import main, progress_bar, say
+from arview.cli.exit_codes import ExitCode, exit_code_of
+from arview.core.progress import check_stop
+from arview.errors import InputError
+from arview.fiducials import parse_board
+from arview.inspection import overall_verdict, verdict_sentence
+from arview.station import rig as cell
+
+_GRADES = {"good": ExitCode.DONE, "usable": ExitCode.UNDECIDED, "not enough": ExitCode.FAIL}
+
+
+@main.group("station", short_help="A cell of fixed cameras: calibrate, check, run.")
+def station() -> None:
+    """A cell of fixed cameras that measures each part within its cycle; `arview station check -h` shows the file."""
+
+
+@station.command(
+    "calibrate",
+    short_help="Find where the cameras of a cell stand.",
+    epilog="""\b
+Examples:
+  arview station calibrate station.toml --board charuco:12x9:20:15:DICT_5X5_250
+  arview station calibrate station.toml --shots 3 --every 10
+  Notes: docs/reference/command-notes.md""",
+    exit_codes={
+        ExitCode.DONE: "good",
+        ExitCode.FAIL: "not good enough to measure with",
+        ExitCode.UNDECIDED: "usable",
+    },
+)
+@click.argument("path", metavar="STATION")
+@click.option("--board", metavar="BOARD", help="Board that is held before the cameras; default: the part is used.")
+@click.option(
+    "--shots", type=click.IntRange(1, 200), default=10, show_default=True, metavar="N", help="Pictures of each camera."
+)
+@click.option(
+    "--every",
+    "interval_s",
+    type=click.FloatRange(0),
+    default=3.0,
+    show_default=True,
+    metavar="S",
+    help="Seconds from one shot to the next, in which board or part is moved; files are read at once.",
+)
+def calibrate(path: str, board: str | None, shots: int, interval_s: float) -> None:
+    """Find the poses of the cameras of STATION with their U, from a board that several of them see at a time.
+
+    Without a board they are found from the part, which every camera must show.
+    """
+    setup = cell.read_station(path)
+    pattern = None if board is None else parse_board(board)
+    lenses = {one.name: one.camera for one in setup.cameras}
+    with tempfile.TemporaryDirectory(prefix="arview-rig-") as folder, cell.RigCameras(setup.cameras) as cameras:
+        taken: list[dict[str, Path]] = []
+        with progress_bar("shots") as progress:
+            while len(taken) < shots:
+                files, _ = cameras.save(Path(folder) / str(len(taken)))
+                if len(files) < 2:
+                    break
+                taken.append(files)
+                progress(len(taken), shots)
+                if cameras.is_live and len(taken) < shots:
+                    _wait(interval_s)
+        if not taken:
+            raise InputError(f"{path}: fewer than two cameras give a picture")
+        if pattern is not None:
+            found = calibration.rig_from_board(taken, lenses, pattern)
+        else:
+            found = calibration.rig_from_part(taken, lenses, setup.part)
+    grade = _print(found)
+    found.save(setup.rig_path)
+    click.echo(f"wrote {setup.rig_path}")
+    click.get_current_context().exit(_GRADES[grade])
+
+
+@station.command(
+    "check",
+    short_help="Check a station file, its sources and its rig.",
+    epilog="""\b
+Examples:
+  arview station check station.toml
+  arview station check --example > station.toml""",
+    exit_codes={ExitCode.DONE: "good", ExitCode.FAIL: "not good enough to measure with", ExitCode.UNDECIDED: "usable"},
+)
+@click.argument("path", metavar="[STATION]", required=False)
+@click.option("--example", "shows_example", is_flag=True, help="Print a station file with all keys.")
+def check(path: str | None, shows_example: bool) -> None:
+    """Check STATION before it is used: every key, every source, the cameras' poses with U, and what is sent where."""
+    if shows_example:
+        click.echo(cell.STATION_FILE_EXAMPLE, nl=False)
+        return
+    if path is None:
+        raise InputError("expected a station file; `arview station check --example` prints one")
+    setup = cell.read_station(path)
+    setup.table.finish()
+    click.echo(f"{setup.name}: part {setup.part.name}, {len(setup.cameras)} cameras, cycles in {setup.cycles}")
+    if not setup.rig_path.is_file():
+        click.echo(f"{setup.rig_path}: not there yet; run `arview station calibrate {path}`")
+        click.get_current_context().exit(ExitCode.FAIL)
+    click.get_current_context().exit(_GRADES[_print(cell.Cell(setup).rig)])
+
+
+@station.command(
+    "run",
+    short_help="Measure a part at each trigger.",
+    epilog="""\b
+Examples:
+  arview station run station.toml
+  arview station run station.toml --cycles 1 --serial BP-0042
+  arview station run station.toml --cycles 200 --every 20""",
+    exit_codes={
+        ExitCode.DONE: "the last part passes",
+        ExitCode.FAIL: "the last part fails",
+        ExitCode.UNDECIDED: "the last part is undecided",
+        ExitCode.CANNOT_MEASURE: "the last part was not measured",
+        ExitCode.INTERRUPTED: "ended by Ctrl-C",
+    },
+)
+@click.argument("path", metavar="STATION")
+@click.option("--cycles", type=click.IntRange(1), metavar="N", help="End after N cycles; without triggers: at once.")
+@click.option(
+    "--every",
+    "interval_s",
+    type=click.FloatRange(0),
+    metavar="S",
+    help="A cycle each S seconds; default: at each press of Enter.",
+)
+@click.option("--serial", metavar="NUMBER", help="Serial number of the part, with --cycles 1.")
+def run(path: str, cycles: int | None, interval_s: float | None, serial: str | None) -> None:
+    """Measure one part after another under the cameras of STATION; each cycle has a folder with its files."""
+    setup = cell.read_station(path)
+    setup.table.finish()
+    if serial is not None and cycles != 1:
+        raise InputError("--serial is of one part: give it with --cycles 1")
+    measuring = cell.Cell(setup)
+    verdict, done = "not_measured", 0
+    with cell.RigCameras(setup.cameras) as cameras:
+        while cycles is None or done < cycles:
+            check_stop()
+            if interval_s is None and cycles is None:
+                click.prompt("Enter measures the next part", default="", show_default=False, prompt_suffix="", err=True)
+            elif done:
+                _wait(interval_s or 0.0)
+            try:
+                cycle = measuring.cycle(cameras, serial)
+            except InputError as error:
+                if done == 0:
+                    raise
+                say(str(error))
+                break
+            done += 1
+            verdict = overall_verdict(cycle.inspection).value
+            click.echo(
+                f"{cycle.folder.name}: {verdict_sentence(cycle.inspection)} ({sum(cycle.seconds.values()):.1f} s)"
+            )
+            for warning in cycle.inspection.warnings:
+                say(warning)
+            measuring.draw(cycle)
+    click.get_current_context().exit(exit_code_of(verdict))
+
+
+def _print(found: calibration.CameraRig) -> str:
+    """Print the cameras with their U, and the verdict; returns the grade."""
+    width = max(len(name) for name in found.names)
+    for name, (turn_deg, place_mm), left_px, shots in zip(
+        found.names, found.uncertainties, found.residuals_px, found.shots, strict=True
+    ):
+        click.echo(f"{name:{width}}  U {place_mm:.3f} mm, {turn_deg:.4f}°; {left_px:.2f} px in {shots} shots")
+    grade, reasons = found.grade
+    click.echo(f"{grade.value}: {found.source}")
+    for reason in reasons:
+        say(reason)
+    return grade.value
+
+
+def _wait(seconds: float) -> None:
+    """Wait, but end soon after Ctrl-C."""
+    end = time.monotonic() + seconds
+    while (left := end - time.monotonic()) > 0:
+        check_stop()
+        time.sleep(min(left, 0.2))

@@ -1,0 +1,157 @@
+"""A cell: from a trigger to a verdict, with cameras whose poses are known."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import cv2
+
+from arview import calibration, measurement, overlay, reconstruction, workflow
+from arview.cad import Part
+from arview.core.atomic import write_file
+from arview.errors import InputError
+from arview.geometry import Array
+from arview.inspection import Inspection, save_inspection
+from arview.pose import Pose, TrackingState
+from arview.station.rig.cameras import RigCameras
+from arview.station.rig.station_file import Station
+
+if TYPE_CHECKING:
+    from arview.calibration import CameraRig
+
+METHODS: tuple[measurement.Method, ...] = ("edges",)
+"""How components are measured: few cameras give the edges more than the surfaces, which need texture."""
+
+
+@dataclass(frozen=True)
+class Cycle:
+    """What one cycle found.
+
+    Attributes:
+        inspection: with no component measured where the part was not found.
+        folder: of its files: pictures, ``inspection.json``, pictures with labels.
+        moved: cameras that have moved, or do not show the part: nothing was measured from them.
+        missing: cameras without a picture, and why.
+        cams_from_model: pose of the part in each camera that was used.
+        seconds: how long pictures, placing and measuring took.
+    """
+
+    inspection: Inspection
+    folder: Path
+    moved: tuple[str, ...] = ()
+    missing: dict[str, str] = field(default_factory=dict)
+    cams_from_model: dict[str, Array] = field(default_factory=dict)
+    seconds: dict[str, float] = field(default_factory=dict)
+
+
+class Cell:
+    """A cell that measures one part after another.
+
+    Args:
+        station: see `Station`; its rig file must exist and name the same cameras.
+
+    Raises:
+        InputError: the rig is missing, damaged or of other cameras.
+    """
+
+    def __init__(self, station: Station) -> None:
+        self.station = station
+        self.rig: CameraRig = calibration.CameraRig.load(station.rig_path)
+        names = tuple(one.name for one in station.cameras)
+        if set(self.rig.names) != set(names):
+            raise InputError(
+                f"{station.rig_path}: is the rig of {', '.join(self.rig.names)}, but the station has"
+                f" {', '.join(names)}; run `arview station calibrate` again"
+            )
+        for name, camera in zip(self.rig.names, self.rig.cameras, strict=True):
+            own = next(one.camera for one in station.cameras if one.name == name)
+            if (own.fx, own.cx, own.cy, own.width) != (camera.fx, camera.cx, camera.cy, camera.width):
+                raise InputError(f"camera {name}: its lens was calibrated anew; run `arview station calibrate` again")
+        self._before: reconstruction.RigPlacement | None = None
+
+    def cycle(self, cameras: RigCameras, serial: str | None = None) -> Cycle:
+        """Take a picture of each camera, and measure the part; its files are in a folder of their own.
+
+        Raises:
+            InputError: no source gives a picture any more.
+            OutputError: a file cannot be written.
+        """
+        began = time.monotonic()
+        folder = self._new_folder(serial)
+        files, missing = cameras.save(folder)
+        if not files:
+            folder.rmdir()
+            raise InputError(f"no camera gives a picture: {'; '.join(f'{k}: {v}' for k, v in missing.items())}")
+        taken = time.monotonic()
+        part = self.station.part if serial is None else replace(self.station.part, serial=serial)
+        sparse = self.rig.posed(files)
+        detail = f"rig of {len(self.rig.names)} cameras, from {self.rig.source}"
+        known = reconstruction.ScaleEvidence("rig", 1.0, self.rig.scale_std, detail)
+        warnings = [f"camera {name}: gave no picture: {why}" for name, why in missing.items()]
+        try:
+            placed = reconstruction.place_on_rig(sparse, part, known, self._before)
+            self._before = placed if placed.found is not None else self._before
+            moved = tuple(one.name for one in placed.moved)
+            seen = self.rig.posed({name: path for name, path in files.items() if name not in moved})
+            found_s = time.monotonic()
+            inspection, poses = self._measured(seen, placed, part)
+        except InputError as error:
+            inspection, poses, moved = workflow.new_inspection(part, serial=serial), {}, ()
+            warnings.append(str(error))
+            found_s = time.monotonic()
+        inspection = replace(
+            inspection,
+            warnings=(*warnings, *inspection.warnings),
+            provenance=replace(inspection.provenance, tool="arview station"),
+        )
+        save_inspection(inspection, folder / "inspection.json")
+        done = time.monotonic()
+        self._remove_old()
+        seconds = {"pictures": taken - began, "placing": found_s - taken, "measuring": done - found_s}
+        return Cycle(inspection, folder, moved, missing, cams_from_model=poses, seconds=seconds)
+
+    def _measured(
+        self, sparse: reconstruction.SparseModel, placed: reconstruction.RigPlacement, part: Part
+    ) -> tuple[Inspection, dict[str, Array]]:
+        """The inspection from the pictures of the cameras that agree, and the part's pose in each."""
+        scale = placed.scale
+        if placed.found is None or scale.scale is None or scale.model_from_scan is None:
+            raise InputError(scale.why_no_frame or "the part is not found in the pictures")
+        if not sparse.photos:
+            raise InputError("the cameras contradict each other: run `arview station calibrate` again")
+        metric = measurement.MetricReconstruction(sparse.transformed(scale.scale, scale.model_from_scan), scale, None)
+        inspection = measurement.measure(metric, part, measurement.MeasureOptions(methods=METHODS))
+        return inspection, {photo.name: photo.cam_from_scan for photo in metric.sparse.photos}
+
+    def draw(self, cycle: Cycle) -> list[Path]:
+        """Write each camera's picture with ghosts and labels, as ``NAME.jpg``."""
+        paths = []
+        for name, pose in cycle.cams_from_model.items():
+            camera = self.rig.cameras[self.rig.names.index(name)]
+            renderer = overlay.OverlayRenderer(self.station.part.model, camera, cycle.inspection)
+            picture = reconstruction.read_photo(cycle.folder / f"{name}.png")
+            drawn = renderer.draw(picture, Pose(pose, None, 1.0, state=TrackingState.TRACKED, time_s=0.0, index=0))
+            _, content = cv2.imencode(".jpg", cv2.cvtColor(drawn, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 88])
+            paths.append(cycle.folder / f"{name}.jpg")
+            write_file(paths[-1], content.tobytes())
+        return paths
+
+    def _new_folder(self, serial: str | None) -> Path:
+        """An empty folder, named by time and serial number."""
+        now = datetime.now(UTC)
+        name = f"{now:%Y%m%dT%H%M%S}{now.microsecond // 1000:03d}Z"
+        safe = "".join(one if one.isalnum() or one in "-_." else "_" for one in serial or "")[:60]
+        folder = self.station.cycles / (f"{name}-{safe}" if safe else name)
+        folder.mkdir(parents=True)
+        return folder
+
+    def _remove_old(self) -> None:
+        """Remove the oldest cycles beyond those that are kept."""
+        done = sorted(path for path in self.station.cycles.iterdir() if path.is_dir() and path.name[:8].isdecimal())
+        for path in done[: max(0, len(done) - self.station.keep)]:
+            shutil.rmtree(path, ignore_errors=True)
