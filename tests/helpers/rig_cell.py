@@ -5,14 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from arview.cad.model import Component, Model, make_model
 from arview.cad.part import ComponentSettings, Part
-from arview.camera import Camera
+from arview.camera import Camera, write_camera
 from arview.fiducials import parse_board
 from arview.geometry import Array, apply, exp_so3, look_at, rigid
-from helpers.cad_files import box
+from helpers import board_scene
+from helpers.cad_files import box, obj_text
 from helpers.photo_scene import Picture, photograph
 from helpers.synthetic import post
 
@@ -90,3 +92,63 @@ def cell(count: int, cameras: int, seed: int = 0) -> Cell:
         poses.append(look_at(430.0 * direction, [0.0, 0.0, 0.0], [0.0, 0.0, 1.0]))
     placement = rigid(exp_so3(np.deg2rad([0.0, 0.0, 5.0]) * rng.uniform(-1, 1)), [*rng.uniform(-8, 8, 2), 0.0])
     return Cell(part, make_model("cell", tuple(built)), moves, np.array(poses), placement)
+
+
+def names_of(cell: Cell) -> list[str]:
+    """Names of the cameras of a cell."""
+    return [f"cam_{index + 1}" for index in range(len(cell.cams_from_rig))]
+
+
+def true_mm(cell: Cell, name: str) -> float:
+    """Distance by which a component's centre of mass is off."""
+    center = cell.part.model.component(name).centroid_in_model
+    return float(np.linalg.norm(apply(cell.moves[name], center) - center))
+
+
+def board_shots(folder: Path, cell: Cell, count: int, seed: int = 0) -> list[dict[str, Path]]:
+    """Pictures of a board that is held before the cameras, tilted and turned anyhow."""
+    rng = np.random.default_rng(seed)
+    shots = []
+    for shot in range(count):
+        tilt = exp_so3(np.deg2rad([*rng.uniform(-18, 18, 2), rng.uniform(0, 360)]))
+        place = rigid(tilt, [*rng.uniform(-30, 30, 2), rng.uniform(10, 60)])
+        upright = rigid(np.eye(3), [-120.0, -90.0, 0.0]) @ rigid(np.diag([1.0, -1.0, -1.0]), [0.0, 180.0, 0.0])
+        one = {}
+        for name, pose in zip(names_of(cell), cell.cams_from_rig, strict=True):
+            one[name] = folder / name / f"board_{shot:03d}.png"
+            one[name].parent.mkdir(parents=True, exist_ok=True)
+            cv2.imwrite(str(one[name]), board_scene.photograph(BOARD, CAMERA, pose @ place @ upright, rng))
+        shots.append(one)
+    return shots
+
+
+def write_part(folder: Path, cell: Cell) -> Path:
+    """The part file of a cell with its CAD."""
+    text, count = "", 0
+    for component in cell.part.model.components:
+        text += obj_text(component.name, component.vertices_in_model, component.faces, count)
+        count += len(component.vertices_in_model)
+    (folder / "cell.obj").write_text(text)
+    lines = ["[part]", 'cad = "cell.obj"', 'unit = "mm"', '[components.plate]\nrole = "base"']
+    lines += [f"[components.{name}]\nposition_tolerance_mm = 0.6" for name in cell.moves]
+    path = folder / "part.toml"
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def write_station(folder: Path, cell: Cell, more: str = "") -> Path:
+    """A station whose cameras are folders of pictures; part, lens files and station file."""
+    write_part(folder, cell)
+    write_camera(CAMERA, folder / "lens.json")
+    lines = ['name = "cell 4"', 'part = "part.toml"', more]
+    lines += [f'[[cameras]]\nname = "{name}"\nsource = "{name}"\ncamera = "lens.json"' for name in names_of(cell)]
+    path = folder / "station.toml"
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def write_pictures(folder: Path, cell: Cell, number: int, turned: dict[int, Array] | None = None) -> None:
+    """The pictures of one cycle, in the folders of the cameras."""
+    for name, picture in zip(names_of(cell), cell.pictures(number, turned), strict=True):
+        (folder / name).mkdir(exist_ok=True)
+        cv2.imwrite(str(folder / name / f"part_{number:03d}.png"), picture[..., ::-1])

@@ -30,6 +30,7 @@ from arview.measurement.uncertainty.combine import (
 )
 from arview.measurement.uncertainty.pose_propagation import (
     PosePropagation,
+    drawn_views,
     shifts_from_poses,
     visibility,
 )
@@ -351,10 +352,11 @@ def test_photos_see_the_side_that_faces_them() -> None:
     low, high = block.bounds_in_model
     middle = 0.5 * (low + high)
     top = np.array([[middle[0], middle[1], high[2]]])
-    assert visibility(top, np.array([[0.0, 0.0, 1.0]]), sparse, model).all()
-    assert not visibility(top - [0, 0, high[2]], np.array([[0.0, 0.0, -1.0]]), sparse, model).any()
+    drawn = drawn_views(sparse, model)
+    assert visibility(top, np.array([[0.0, 0.0, 1.0]]), sparse, drawn).all()
+    assert not visibility(top - [0, 0, high[2]], np.array([[0.0, 0.0, -1.0]]), sparse, drawn).any()
     side = np.array([[high[0], middle[1], middle[2]]])
-    seen = visibility(side, np.array([[1.0, 0.0, 0.0]]), sparse, model)[0]
+    seen = visibility(side, np.array([[1.0, 0.0, 0.0]]), sparse, drawn)[0]
     ahead = np.array([p.centre_in_scan[0] > 150 for p in sparse.photos])
     assert 0 < ahead.sum() < len(ahead)
     assert seen.sum() >= 2 and not seen[~ahead].any()

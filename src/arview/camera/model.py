@@ -137,12 +137,27 @@ class Camera:
     def slopes(self, points_in_cam: Array) -> Array:
         """(N,2,3) derivatives of the pixels of points (N,3) in the camera frame, px by the points' unit.
 
-        Differences with steps of one millionth of the depth, through any lens.
+        Through a lens of another model by differences with steps of one millionth of the depth.
         """
-        delta = 1e-6 * points_in_cam[:, 2:]
-        pixels = self.project(points_in_cam)
-        moved = [(self.project(points_in_cam + delta * axis) - pixels) / delta for axis in np.eye(3)]
-        return np.stack(moved, axis=2)
+        z = np.where(points_in_cam[:, 2] > 0, points_in_cam[:, 2], np.nan)
+        if self.lens is not None:
+            delta = 1e-6 * z[:, None]
+            pixels = self.project(points_in_cam)
+            moved = [(self.project(points_in_cam + delta * axis) - pixels) / delta for axis in np.eye(3)]
+            return np.stack(moved, axis=2)
+        k1, k2, p1, p2, k3 = self.dist.tolist()
+        x, y = points_in_cam[:, 0] / z, points_in_cam[:, 1] / z
+        r2 = x * x + y * y
+        radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        bend = 2.0 * (k1 + r2 * (2.0 * k2 + 3.0 * r2 * k3))
+        xx = radial + x * x * bend + 2.0 * p1 * y + 6.0 * p2 * x
+        xy = x * y * bend + 2.0 * p1 * x + 2.0 * p2 * y
+        yy = radial + y * y * bend + 6.0 * p1 * y + 2.0 * p2 * x
+        result = np.empty((len(z), 2, 3))
+        result[:, 0, 0], result[:, 0, 1], result[:, 0, 2] = xx, xy, -(xx * x + xy * y)
+        result[:, 1, 0], result[:, 1, 1], result[:, 1, 2] = xy, yy, -(xy * x + yy * y)
+        result *= np.array([[self.fx], [self.fy]]) / z[:, None, None]
+        return result
 
     def distort(self, x: Array, y: Array) -> tuple[Array, Array]:
         """Distorted normalised coordinates of ideal ones (Brown 1966, OpenCV's formula; or the lens model)."""

@@ -182,17 +182,17 @@ def _crop(
     views: PhotoViews, view: int, level: int, pixels: Array, reach_px: float
 ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
     """The part of a photo around some pixels in linear light, and its first pixel (u, v)."""
-    stack = views.levels[level]
-    width, height = stack.sizes[view]
-    gray = stack.pixels[stack.starts[view] : stack.starts[view] + width * height].reshape(height, width)
+    width, height = views.levels[level].sizes[view]
     margin = reach_px + 12.0
     low = np.clip(np.floor(pixels.min(axis=0, initial=0.0 if not len(pixels) else np.inf) - margin), 0, [width, height])
     high = np.clip(np.ceil(pixels.max(axis=0, initial=0.0) + margin), 0, [width, height])
     first, last = low.astype(np.int64), np.maximum(high, low + 4).astype(np.int64)
-    part = gray[first[1] : last[1], first[0] : last[0]]
+    window = slice(first[1], last[1]), slice(first[0], last[0])
+    whole = views.linear(view, level)
+    part = views.gray(view, level)[window] if whole is None else whole[window]
     if part.size == 0:
         return np.zeros((4, 4), dtype=np.float32), np.zeros(2, dtype=np.int64)
-    return linear_light(np.ascontiguousarray(part)), first
+    return linear_light(np.ascontiguousarray(part)) if whole is None else np.ascontiguousarray(part), first
 
 
 def pose_gain(views: PhotoViews, fit: RigidFit, view: NDArray[np.int64], rows: Array) -> Array:

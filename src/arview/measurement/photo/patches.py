@@ -77,13 +77,13 @@ def near_others(points: Array, model: Model, component: int, reach_mm: float) ->
     """(N,) which points (N,3) are within ``reach_mm`` of the surface of any other component."""
     result = np.zeros(len(points), dtype=np.bool_)
     for index, other in enumerate(model.components):
-        corners = other.vertices_in_model[other.faces]
-        if index == component or len(corners) == 0:
+        if index == component:
             continue
-        low, high = corners.min(axis=(0, 1)) - reach_mm, corners.max(axis=(0, 1)) + reach_mm
+        low, high = other.bounds_in_model[0] - reach_mm, other.bounds_in_model[1] + reach_mm
         (near,) = np.nonzero(~result & ((points >= low) & (points <= high)).all(axis=1))
         if len(near) == 0:
             continue
+        corners = other.vertices_in_model[other.faces]
         low, high = points[near].min(axis=0) - reach_mm, points[near].max(axis=0) + reach_mm
         corners = corners[((corners.min(axis=1) <= high) & (corners.max(axis=1) >= low)).all(axis=1)]
         result[near] = _nearer_than(points[near], np.ascontiguousarray(corners), reach_mm)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import cv2
@@ -13,10 +14,14 @@ from arview.cad import Model
 from arview.camera import Camera
 from arview.core.kernel import kernel
 from arview.core.parallel import pool
+from arview.core.subpixel_edges import linear_light
 from arview.errors import InputError
 from arview.geometry import Array, apply
 from arview.reconstruction import SparseModel
 from arview.rendering import rasterise
+
+MAX_LINEAR_PX = 24_000_000
+"""Pixels of all photos up to which they are kept in linear light too: 130 MB with their reduced sizes."""
 
 
 class PhotoStack(NamedTuple):
@@ -78,11 +83,23 @@ class PhotoViews:
         """(M,3) camera centres in the model frame, mm."""
         return -np.einsum("mji,mj->mi", self.cam_from_model[:, :3, :3], self.cam_from_model[:, :3, 3])
 
-    def gray(self, view: int) -> NDArray[np.uint8]:
-        """(H,W) uint8 picture of one photo."""
-        stack = self.levels[0]
+    def gray(self, view: int, level: int = 0) -> NDArray[np.uint8]:
+        """(H,W) uint8 picture of one photo, at full size or at a half for each level."""
+        stack = self.levels[level]
         width, height = stack.sizes[view]
         return stack.pixels[stack.starts[view] : stack.starts[view] + width * height].reshape(height, width)
+
+    def linear(self, view: int, level: int) -> NDArray[np.float32] | None:
+        """The same in linear light, made once; None where all photos together are too large to be kept so."""
+        if len(self.levels[0].pixels) > MAX_LINEAR_PX:
+            return None
+        if (view, level) not in self._linear:
+            self._linear[view, level] = linear_light(np.ascontiguousarray(self.gray(view, level)))
+        return self._linear[view, level]
+
+    @cached_property
+    def _linear(self) -> dict[tuple[int, int], NDArray[np.float32]]:
+        return {}
 
     def mm_per_px(self, point: Array) -> float:
         """Size of a pixel at a point (3,): median over the photos in front of which it lies.

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arview.cad import Component, Model
+from arview.camera import Camera
 from arview.core.parallel import pool
 from arview.errors import InputError
 from arview.geometry import Array, apply
@@ -58,23 +59,36 @@ def shifts_from_poses(
     return parts
 
 
-def visibility(points: Array, normals: Array, sparse: SparseModel, model: Model) -> NDArray[np.bool_]:
-    """(N,M) which photos, posed in the model's frame, show surface points (N,3) with normals (N,3)."""
+DrawnViews = Sequence[tuple[Camera, NDArray[np.float32]]]
+"""Camera and depth (H,W) of the model as each photo shows it, reduced."""
 
-    def seen_in(photo: PosedPhoto) -> NDArray[np.bool_]:
+
+def drawn_views(sparse: SparseModel, model: Model) -> DrawnViews:
+    """The model drawn as photos posed in its frame show it."""
+
+    def drawn(photo: PosedPhoto) -> tuple[Camera, NDArray[np.float32]]:
         shrink = min(1.0, DRAWN_PX / max(photo.camera.width, photo.camera.height))
         size = (round(photo.camera.width * shrink), round(photo.camera.height * shrink))
         camera = photo.camera.without_distortion().scaled(*size)
-        depth = ZBufferRenderer(model, camera).render(photo.cam_from_scan).depth_mm
+        return camera, ZBufferRenderer(model, camera).render(photo.cam_from_scan).depth_mm
+
+    return list(pool().map(drawn, sparse.photos))
+
+
+def visibility(points: Array, normals: Array, sparse: SparseModel, drawn: DrawnViews) -> NDArray[np.bool_]:
+    """(N,M) which photos, posed in the model's frame and drawn, show surface points (N,3) with normals (N,3)."""
+
+    def seen_in(photo: PosedPhoto, camera: Camera, depth: NDArray[np.float32]) -> NDArray[np.bool_]:
         in_cam = apply(photo.cam_from_scan, points)
         pixels = camera.project(in_cam)
-        inside = np.all(np.isfinite(pixels) & (pixels >= 0) & (pixels <= np.array(size) - 1), axis=1)
+        last = np.array([camera.width, camera.height]) - 1
+        inside = np.all(np.isfinite(pixels) & (pixels >= 0) & (pixels <= last), axis=1)
         u, v = np.round(np.where(inside[:, None], pixels, 0.0)).astype(np.intp).T
         facing = np.sum(normals * (photo.centre_in_scan - points), axis=1) > 0.2 * np.linalg.norm(in_cam, axis=1)
         near = np.abs(depth[v, u] - in_cam[:, 2]) < 4.0 * in_cam[:, 2] / camera.fx
         return np.asarray(inside & facing & near)
 
-    return np.stack(list(pool().map(seen_in, sparse.photos)), axis=1)
+    return np.stack([seen_in(photo, *one) for photo, one in zip(sparse.photos, drawn, strict=True)], axis=1)
 
 
 def surface_points(component: Component, count: int, seed: int = 0) -> tuple[Array, Array]:
@@ -117,6 +131,7 @@ class PosePropagation:
         if sparse.pose_covariance is None:
             raise InputError("uncertainty: the reconstruction has no covariance of its poses; reconstruct again")
         self.sparse, self.model, self.alignment, self.count = sparse, model, alignment, points
+        self._drawn = drawn_views(sparse, model)
         self.has_lenses = sparse.lens_covariance is not None
         self.covariance = sparse.pose_covariance if sparse.lens_covariance is None else sparse.lens_covariance
         self.used = used or (lambda name: np.ones(len(sparse.photos), dtype=np.bool_))
@@ -170,7 +185,7 @@ class PosePropagation:
         some = np.arange(0, len(points), step)
         toward = np.mean([p.centre_in_scan for p in self.sparse.photos], axis=0) - points[some].mean(axis=0)
         facing = np.tile(toward / np.linalg.norm(toward), (len(some), 1))
-        sees = visibility(points[some], facing, self.sparse, self.model) & self.used(None)
+        sees = visibility(points[some], facing, self.sparse, self._drawn) & self.used(None)
         moved = shifts_from_poses(points[some], self.sparse.photos, sees, self.has_lenses)
         apart = np.linalg.norm(points[:, None] - points[some][None], axis=2)
         apart[:, sees.sum(axis=1) < 2] = np.inf
@@ -184,7 +199,7 @@ class PosePropagation:
     def _shifts(self, component: Component) -> tuple[Array, Array]:
         """Visible points of a component, and their derivative by the poses."""
         points, normals = surface_points(component, 3 * self.count)
-        sees = visibility(points, normals, self.sparse, self.model) & self.used(component.name)
+        sees = visibility(points, normals, self.sparse, self._drawn) & self.used(component.name)
         kept = np.flatnonzero(sees.sum(axis=1) >= 2)[: self.count]
         if len(kept) < 3:
             return points[:3], np.zeros((3, 3, len(self.covariance)))

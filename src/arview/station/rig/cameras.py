@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from arview.core.atomic import write_file
 from arview.errors import InputError
-from arview.station.rig.station_file import StationCamera
+from arview.station.rig.station_file import RigCamera
 from arview.video import Frame, FrameSource, open_source
 
 _OLD_FRAMES = 1
@@ -28,7 +28,7 @@ class RigCameras:
         InputError: a source cannot be opened, or its pictures have another size than its camera file.
     """
 
-    def __init__(self, cameras: Sequence[StationCamera]) -> None:
+    def __init__(self, cameras: Sequence[RigCamera]) -> None:
         self.cameras = tuple(cameras)
         self._pool = ThreadPoolExecutor(len(self.cameras), "arview-rig")
         self._sources: list[FrameSource] = []

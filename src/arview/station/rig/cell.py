@@ -11,15 +11,16 @@ from typing import TYPE_CHECKING
 
 import cv2
 
-from arview import calibration, measurement, overlay, reconstruction, workflow
+from arview import calibration, measurement, overlay, reconstruction
 from arview.cad import Part
 from arview.core.atomic import write_file
 from arview.errors import InputError
 from arview.geometry import Array
 from arview.inspection import Inspection, save_inspection
-from arview.pose import Pose, TrackingState
+from arview.pose import ComponentPresence, Pose, Presence, TrackingState, Visibility
 from arview.station.rig.cameras import RigCameras
 from arview.station.rig.station_file import Station
+from arview.workflow.new_inspection import new_inspection
 
 if TYPE_CHECKING:
     from arview.calibration import CameraRig
@@ -101,7 +102,7 @@ class Cell:
             found_s = time.monotonic()
             inspection, poses = self._measured(seen, placed, part)
         except InputError as error:
-            inspection, poses, moved = workflow.new_inspection(part, serial=serial), {}, ()
+            inspection, poses, moved = new_inspection(part, serial=serial), {}, ()
             warnings.append(str(error))
             found_s = time.monotonic()
         inspection = replace(
@@ -131,11 +132,13 @@ class Cell:
     def draw(self, cycle: Cycle) -> list[Path]:
         """Write each camera's picture with ghosts and labels, as ``NAME.jpg``."""
         paths = []
+        presence = _presence(cycle.inspection, self.station.part)
         for name, pose in cycle.cams_from_model.items():
             camera = self.rig.cameras[self.rig.names.index(name)]
             renderer = overlay.OverlayRenderer(self.station.part.model, camera, cycle.inspection)
             picture = reconstruction.read_photo(cycle.folder / f"{name}.png")
-            drawn = renderer.draw(picture, Pose(pose, None, 1.0, state=TrackingState.TRACKED, time_s=0.0, index=0))
+            seen = Pose(pose, None, 1.0, state=TrackingState.TRACKED, time_s=0.0, index=0, components=presence)
+            drawn = renderer.draw(picture, seen)
             _, content = cv2.imencode(".jpg", cv2.cvtColor(drawn, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 88])
             paths.append(cycle.folder / f"{name}.jpg")
             write_file(paths[-1], content.tobytes())
@@ -155,3 +158,13 @@ class Cell:
         done = sorted(path for path in self.station.cycles.iterdir() if path.is_dir() and path.name[:8].isdecimal())
         for path in done[: max(0, len(done) - self.station.keep)]:
             shutil.rmtree(path, ignore_errors=True)
+
+
+def _presence(inspection: Inspection, part: Part) -> dict[str, ComponentPresence]:
+    """What the measurement says of each component's presence; the base is there, since the part was found by it."""
+    found = {one.name: one.is_present for one in inspection.components}
+    kinds = {True: Presence.PRESENT, False: Presence.MISSING, None: Presence.UNVERIFIED}
+    return {
+        one.name: ComponentPresence(kinds[found.get(one.name, True)], Visibility.VISIBLE, 1.0, 1, 0.0)
+        for one in part.model.components
+    }

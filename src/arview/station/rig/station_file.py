@@ -37,7 +37,7 @@ MIN_CAMERAS = 3
 
 
 @dataclass(frozen=True)
-class StationCamera:
+class RigCamera:
     """One camera of a cell: where its frames come from, its intrinsics, and how many frames are averaged."""
 
     name: str
@@ -64,7 +64,7 @@ class Station:
     name: str
     path: Path
     part: Part
-    cameras: tuple[StationCamera, ...]
+    cameras: tuple[RigCamera, ...]
     rig_path: Path
     cycles: Path
     keep: int
@@ -86,7 +86,7 @@ def read_station(path: str | Path) -> Station:
         raise InputError(f"{path}: is not a TOML file ({error})") from error
     table = TomlTable(path, "", content)
     folder = path.parent
-    cameras: list[StationCamera] = []
+    cameras: list[RigCamera] = []
     for entry in table.tables("cameras"):
         name, source = entry.line("name", ""), _located(folder, entry.text("source"))
         if not _NAME.fullmatch(name) or name in {one.name for one in cameras}:
@@ -97,7 +97,7 @@ def read_station(path: str | Path) -> Station:
         check_source(source)
         camera = load_camera(folder / entry.text("camera"))
         entry.finish()
-        cameras.append(StationCamera(name, source, camera, int(burst)))
+        cameras.append(RigCamera(name, source, camera, int(burst)))
     if len(cameras) < MIN_CAMERAS:
         raise InputError(f"{path}: has {len(cameras)} [[cameras]]; a cell needs at least {MIN_CAMERAS} to measure")
     keep = table.positive("keep", 200.0) or 200.0
