@@ -58,6 +58,7 @@ from suites.quality import quality_rows
 from suites.real_conditions import REAL_FRAMES, REAL_SHAPES, RealConditionsSuite
 from suites.reconstruction import reconstruction_rows
 from suites.relocalization import relocalization_rows
+from suites.rig import rig_rows
 from suites.scale import SCALED, acceptance_rows, scale_rows
 from suites.several import SeveralSuite
 from suites.single_photos import evaluate_photos, photo_rows
@@ -69,7 +70,7 @@ SECTIONS = (
     "track", "converge", "guided-init", "detect", "semisynthetic-track", "semisynthetic-detect", "false-alarms",
     "lookalike", "relocalize", "sample", "reconstruct", "measure", "real-track", "real-detect", "quality",
     "accepted", "scale", "presence", "several", "occluders", "coverage",
-    "capture", "identity", "features",
+    "capture", "identity", "features", "rig",
 )  # fmt: skip
 
 
@@ -145,6 +146,7 @@ def main() -> None:
         lambda: capture_rows(capture_sets(chosen.photo_set), chosen.folder / "capture", details),
         IdentitySuite(found, details, chosen.two_parts, chosen.folder, chosen.frames, chosen.backgrounds).rows,
         lambda: feature_rows(details),
+        lambda: rig_rows(details),
     )
     sections = dict(zip(SECTIONS, makers, strict=True))
     rows: list[ResultRow] = []

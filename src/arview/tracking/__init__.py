@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from arview.tracking.estimate import Estimate as Estimate
     from arview.tracking.estimate import PosePrior as PosePrior
     from arview.tracking.guide_pose import GUIDE_PREFIX as GUIDE_PREFIX
+    from arview.tracking.rig_session import RigSession as RigSession
     from arview.tracking.self_calibration.estimator import FocalEstimate as FocalEstimate
     from arview.tracking.self_calibration.profile import keep_profile as keep_profile
     from arview.tracking.session import TrackedPart as TrackedPart
@@ -29,6 +30,7 @@ __getattr__, __dir__, __all__ = lazy_door(
             "PosePrior",
         ),
         "guide_pose": ("GUIDE_PREFIX",),
+        "rig_session": ("RigSession",),
         "self_calibration.estimator": ("FocalEstimate",),
         "self_calibration.profile": ("keep_profile",),
         "session": (
