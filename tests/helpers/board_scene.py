@@ -64,7 +64,8 @@ def circle_radius_mm(board: Board) -> float:
 @cache
 def _rays(width: int, height: int, numbers: tuple[float, ...], lens: LensDistortion | None) -> NDArray[np.float32]:
     """(H·s, W·s, 2) ideal normalised coordinates of sub-pixels; 1e6 where the lens sees nothing."""
-    camera = Camera(width, height, *numbers[:4], np.array(numbers[4:]), lens)
+    fx, fy, cx, cy, *terms = numbers
+    camera = Camera(width, height, fx, fy, cx, cy, np.array(terms), lens)
     step = (np.arange(_SUPER) + 0.5) / _SUPER - 0.5
     u = (np.arange(width)[:, None] + step).ravel()
     v = (np.arange(height)[:, None] + step).ravel()

@@ -126,7 +126,7 @@ def write_part(folder: Path, cell: Cell) -> Path:
     """The part file of a cell with its CAD."""
     text, count = "", 0
     for component in cell.part.model.components:
-        text += obj_text(component.name, component.vertices_in_model, component.faces, count)
+        text += obj_text(component.name, component.vertices_in_model, component.faces.astype(np.int64), count)
         count += len(component.vertices_in_model)
     (folder / "cell.obj").write_text(text)
     lines = ["[part]", 'cad = "cell.obj"', 'unit = "mm"', '[components.plate]\nrole = "base"']
