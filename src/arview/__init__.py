@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from arview.pose import Pose
     from arview.reconstruction.run import reconstruct
     from arview.report import make_report
-    from arview.tracking import PointMatches, PosePrior, SessionOptions, Tracker, TrackingSession
+    from arview.tracking import PointMatches, PosePrior, RigSession, SessionOptions, Tracker, TrackingSession
     from arview.video import VideoSink, open_source
     from arview.workflow.job import InspectJob
     from arview.workflow.run import inspect_part
@@ -48,6 +48,7 @@ __all__ = [
     "PointMatches",
     "Pose",
     "PosePrior",
+    "RigSession",
     "SessionOptions",
     "Tracker",
     "TrackingSession",
@@ -82,7 +83,7 @@ _MODULES = {
     "arview.pose": ("Pose",),
     "arview.reconstruction.run": ("reconstruct",),
     "arview.report": ("make_report",),
-    "arview.tracking": ("PointMatches", "PosePrior", "SessionOptions", "Tracker", "TrackingSession"),
+    "arview.tracking": ("PointMatches", "PosePrior", "RigSession", "SessionOptions", "Tracker", "TrackingSession"),
     "arview.video": ("VideoSink", "open_source"),
     "arview.workflow.job": ("InspectJob",),
     "arview.workflow.run": ("inspect_part",),
