@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from arview.cli.common import main, say
+from arview.cli.common import RESOURCES, SCHEDULER, main, say
 from arview.cli.exit_codes import ExitCode, exit_code_of
 from arview.quality import batch as quality
 from arview.quality import history
@@ -35,7 +35,8 @@ Examples:
     },
 )
 @click.argument("jobs_path", metavar="JOBS.toml")
-@click.option("--scheduler", metavar="URL", help="tcp://host:port of a Dask scheduler; default: local workers.")
+@SCHEDULER
+@RESOURCES
 @click.option(
     "--workers",
     type=click.IntRange(min=1),
@@ -70,6 +71,7 @@ Examples:
 def batch(
     jobs_path: str,
     scheduler: str | None,
+    resources: dict[str, float],
     workers: int | None,
     memory_limit: str,
     retries: int,
@@ -83,7 +85,7 @@ def batch(
     jobs = quality.load_jobs(jobs_path)
     if store is not None:
         history.HistoryStore(store, tell=say).close()
-    options = quality.BatchOptions(scheduler, workers or 0, memory_limit, retries, connect_s)
+    options = quality.BatchOptions(scheduler, workers or 0, memory_limit, retries, connect_s, resources=resources)
     with tqdm(desc="jobs", total=len(jobs), disable=None, leave=False, unit="") as bar:
 
         def started(link: str, count: int) -> None:

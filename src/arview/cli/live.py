@@ -18,6 +18,8 @@ import click
 from arview import guideviews
 from arview.cli.common import (
     RENDERER,
+    RESOURCES,
+    SCHEDULER,
     UNIT,
     check_profile,
     inspection_file,
@@ -35,6 +37,8 @@ from arview.station import live as station
 if TYPE_CHECKING:
     pass
 
+CLUSTER_JOBS = 16
+"""Inspections that are given to a cluster at once; it puts them in order by itself."""
 STOP_DEADLINE_S = 4.6
 """Time from a signal to the end of the program, whatever its workers do."""
 _AGES_S = {"min": 60.0, "h": 3600.0, "d": 86400.0}
@@ -180,6 +184,8 @@ Examples:
     metavar="DAYS",
     help="Put signed jobs DAYS old into FOLDER/archive.",
 )
+@SCHEDULER
+@RESOURCES
 @click.option(
     "--devices",
     is_flag=True,
@@ -232,6 +238,8 @@ def live(
     max_age: float | None,
     jobs: str,
     archive: float | None,
+    scheduler: str | None,
+    resources: dict[str, float],
     size: tuple[int, int],
     fps: float,
     renderer: str,
@@ -264,7 +272,13 @@ def live(
         record=video,
         record_folder=video.parent if video else Path(),
         recording=station.RecordingOptions(quota_bytes=round(1e9 * quota)),
-        jobs=station.JobOptions(folder=Path(jobs), archive_days=archive),
+        jobs=station.JobOptions(
+            folder=Path(jobs),
+            archive_days=archive,
+            workers=CLUSTER_JOBS if scheduler else 1,
+            scheduler=scheduler,
+            resources=resources,
+        ),
         width=size[0],
         height=size[1],
         fps=fps,

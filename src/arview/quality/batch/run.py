@@ -11,9 +11,9 @@ import hashlib
 import json
 import os
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -67,6 +67,9 @@ class BatchOptions:
     retries: int = 2  # attempts after failures that may be temporary: storage, memory, a dead worker
     connect_s: float = 15.0  # time in which a scheduler must answer
     scratch: str | None = None  # folder for downloaded files; None: that of the system for temporary files
+    resources: Mapping[str, float] = field(
+        default_factory=dict
+    )  # that workers of a scheduler must have, such as GPU: 1
 
 
 @dataclass(frozen=True)
@@ -228,7 +231,14 @@ def run_batch(
             jobs = [one if one.job.threads else replace(one, job=replace(one.job, threads=threads)) for one in jobs]
         futures = {
             client.submit(
-                run_job, one, work, options.scratch, key=f"arview-{one.name}", pure=False, retries=options.retries
+                run_job,
+                one,
+                work,
+                options.scratch,
+                key=f"arview-{one.name}",
+                pure=False,
+                retries=options.retries,
+                resources=dict(options.resources) or None,
             ): one
             for one in jobs
         }

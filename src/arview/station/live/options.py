@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -45,7 +46,9 @@ class JobOptions:
     folder: Path = Path("arview_jobs")  # made when the first inspection is started
     min_free_bytes: int = 500_000_000  # free disk space that is left to results and other programs
     archive_days: float | None = None  # signed jobs unchanged for so long are moved to archive/; None: never
-    workers: int = 1  # measurements that run at once; each uses both of two cores
+    workers: int = 1  # measurements that run at once; each uses both of two cores, unless they are on a cluster
+    scheduler: str | None = None  # tcp://host:port of a Dask cluster that measures; None: this machine
+    resources: Mapping[str, float] = field(default_factory=dict)  # that its workers must have, such as GPU: 1
 
 
 @dataclass(frozen=True)

@@ -374,18 +374,21 @@ def jobs_in(folder: str | Path) -> list[JobFolder]:
     return [one for job in first for one in (job, *job.rechecks())]
 
 
-def start_worker(job: JobFolder) -> subprocess.Popen[bytes]:
-    """Start the process that measures a job; it ends by itself when the job is done.
+def start_worker(
+    job: JobFolder, scheduler: str | None = None, resources: Mapping[str, float] | None = None
+) -> subprocess.Popen[bytes]:
+    """Start the process that measures a job, here or on a Dask cluster; it ends by itself when the job is done.
 
     What it prints goes to ``worker.log`` in the job's folder. A second one for the same job ends at once.
 
     Raises:
         OutputError: the folder cannot be written to, or the process cannot be started.
     """
+    cluster = [json.dumps({"scheduler": scheduler, "resources": dict(resources or {})})] if scheduler else []
     try:
         with (job.path / "worker.log").open("ab") as log:
             return subprocess.Popen(
-                [sys.executable, "-m", "arview.station.walk", str(job.path)],
+                [sys.executable, "-m", "arview.station.walk", str(job.path), *cluster],
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=log,

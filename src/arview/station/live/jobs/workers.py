@@ -18,6 +18,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -81,7 +82,8 @@ class WorkerQueue:
     def __init__(
         self, options: JobOptions, start: Start | None = None, on_done: Callable[[walk.JobFolder], None] | None = None
     ) -> None:
-        self._options, self._start, self._on_done = options, start or walk.start_worker, on_done
+        here = partial(walk.start_worker, scheduler=options.scheduler, resources=options.resources)
+        self._options, self._start, self._on_done = options, start or here, on_done
         self._lock = threading.RLock()
         self._entries: dict[str, _Entry] = {}
         self._is_closed = False
