@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from arview.cad.shape.symmetry import FoundSymmetry as FoundSymmetry
     from arview.cad.shape.symmetry import Symmetry as Symmetry
     from arview.cad.shape.symmetry import find_symmetries as find_symmetries
+    from arview.cad.toml_table import TomlTable as TomlTable
     from arview.cad.view_range import ViewRange as ViewRange
     from arview.cad.viewpoint import Viewpoint as Viewpoint
     from arview.cad.viewpoint import pose_at as pose_at
@@ -102,6 +103,7 @@ __getattr__, __dir__, __all__ = lazy_door(
             "Symmetry",
             "find_symmetries",
         ),
+        "toml_table": ("TomlTable",),
         "view_range": ("ViewRange",),
         "viewpoint": (
             "Viewpoint",
