@@ -84,16 +84,16 @@ class OpcuaView(Outlet):
         )
         count, last = 0, None
         async with server:
-            self.is_connected, self.error = True, ""
             while True:
                 if (result := self._result()) is not last:
                     count, last = count + 1, result
                 await self._show(space, {**_variables(self._state(), result), (*RESULTS, "ResultCount"): count})
+                self.is_connected, self.error = True, ""
                 await self.await_news()
 
     async def _show(self, space: int, values: dict[Path, Any]) -> None:
         """Write what has changed; None, and what is no longer there, is the status "no data"."""
-        no_data = ua.DataValue(StatusCode_=ua.StatusCode(ua.StatusCodes.BadNoData))
+        no_data = ua.DataValue(ua.Variant(), ua.StatusCode(ua.StatusCodes.BadNoData))
         for path, value in {**dict.fromkeys(self._shown.keys() - values.keys()), **values}.items():
             if path not in self._shown or self._shown[path] != value:
                 kind = KINDS.get(path[-1], ua.VariantType.String)
@@ -108,7 +108,7 @@ class OpcuaView(Outlet):
             if kind is None:
                 self._nodes[path] = await parent.add_object(*names)
             else:
-                self._nodes[path] = await parent.add_variable(*names, None, kind, ua.NodeId(kind.value))
+                self._nodes[path] = await parent.add_variable(*names, ua.get_default_value(kind), kind)
         return self._nodes[path]
 
     def _start_job(self, parent: Any, serial: str | None, order: str | None, recipe: str | None) -> Any:
