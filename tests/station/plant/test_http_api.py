@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import jsonschema
 import msgspec
 import pytest
 from starlette.applications import Starlette
-from starlette.testclient import TestClient
 
 from arview.inspection import Verdict
 from arview.station.plant import Plant, plant_routes, result_of
@@ -30,8 +31,51 @@ def plant(tmp_path: Path) -> Iterator[Plant]:
         yield opened
 
 
-def client(plant: Plant, token: str = "") -> TestClient:
-    return TestClient(Starlette(routes=plant_routes(plant, token)))
+class Answer:
+    """Status and text of an answer."""
+
+    def __init__(self, status_code: int, content: bytes) -> None:
+        self.status_code, self.text = status_code, content.decode()
+
+    def json(self) -> Any:
+        return json.loads(self.text)
+
+
+class Http:
+    """Asks the routes as a server would."""
+
+    def __init__(self, app: Starlette) -> None:
+        self._app = app
+
+    def get(self, path: str, headers: dict[str, str] | None = None) -> Answer:
+        return self.ask("GET", path, b"", headers or {})
+
+    def post(
+        self, path: str, json: object = None, content: bytes | None = None, headers: dict[str, str] | None = None
+    ) -> Answer:
+        body = msgspec.json.encode(json) if content is None else content
+        return self.ask("POST", path, body, {"content-type": "application/json", **(headers or {})})
+
+    def ask(self, method: str, path: str, body: bytes, headers: dict[str, str]) -> Answer:
+        said: list[Any] = []
+        scope = {
+            "type": "http", "asgi": {"version": "3.0"}, "http_version": "1.1", "method": method, "path": path,
+            "raw_path": path.encode(), "query_string": b"", "scheme": "http", "server": ("127.0.0.1", 80),
+            "headers": [(name.lower().encode(), value.encode()) for name, value in headers.items()],
+        }  # fmt: skip
+
+        async def receive() -> dict[str, Any]:
+            return {"type": "http.request", "body": body, "more_body": False}
+
+        async def send(message: Any) -> None:
+            said.append(message)
+
+        asyncio.run(self._app(scope, receive, send))
+        return Answer(said[0]["status"], b"".join(one.get("body", b"") for one in said[1:]))
+
+
+def client(plant: Plant, token: str = "") -> Http:
+    return Http(Starlette(routes=plant_routes(plant, token)))
 
 
 def test_health_ready_and_metrics(plant: Plant) -> None:

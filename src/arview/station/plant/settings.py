@@ -89,7 +89,9 @@ class PlantSettings(_Table, frozen=True, kw_only=True):
         try:
             return None if file is None else Path(self.folder, file).read_text(encoding="utf-8").rstrip("\r\n")
         except (OSError, UnicodeDecodeError) as error:
-            raise InputError(f"{Path(self.folder, file or '')}: cannot be read ({error})") from error
+            raise InputError(
+                f"{Path(self.folder, file or '')}: cannot be read ({getattr(error, 'strerror', error)})"
+            ) from error
 
 
 def read_plant(root: cad.TomlTable) -> PlantSettings:
