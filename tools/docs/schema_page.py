@@ -1,4 +1,4 @@
-"""The JSON Schema of ``inspection.json`` as a Markdown page."""
+"""The JSON Schemas of ``inspection.json`` and of the messages of the plant as Markdown pages."""
 
 from __future__ import annotations
 
@@ -30,6 +30,23 @@ def schema_markdown() -> str:
         if definition.get("type") == "object":
             sections.append(_section(name, definition))
     return _INTRODUCTION.format(version=SCHEMA_VERSION) + "\n".join(sections)
+
+
+_MESSAGES = """# Messages of the plant
+
+What a station sends and receives, see [the plant](plant.md). This page is generated from
+`src/arview/station/plant/messages.py`. Each message is a JSON object; keys that are not listed are an error. Lengths
+are in millimetres, times UTC in ISO 8601. A key that changes its meaning changes `version`.
+
+"""
+
+
+def messages_markdown() -> str:
+    """The page of the messages: a section with a table of the keys for each."""
+    from arview.station.plant.schema import message_schemas
+
+    schemas = message_schemas()
+    return _MESSAGES + "\n".join(_section(name, one) for name, one in schemas.items() if "properties" in one)
 
 
 def _section(title: str, definition: dict[str, Any]) -> str:

@@ -4,19 +4,24 @@ from __future__ import annotations
 
 import asyncio
 import json
+import re
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
+from runpy import run_path
 from typing import Any
 
 import jsonschema
 import msgspec
 import pytest
+import yaml
 from starlette.applications import Starlette
 
 from arview.inspection import Verdict
 from arview.station.plant import Plant, plant_routes, result_of
-from arview.station.plant.messages import Result, Trigger
+from arview.station.plant.messages import MeasuredValue, Result, Trigger
 from arview.station.plant.schema import TOPICS, message_schemas
+from arview.station.plant.settings import AlarmTable, MqttTable, OpcuaTable, PlantSettings
 from helpers.inspections import bench_inspection
 from helpers.paths import ROOT
 from helpers.photo_scene import bench
@@ -155,12 +160,29 @@ def test_the_schema_describes_what_is_sent(plant: Plant) -> None:
 
 def test_every_key_is_described() -> None:
     for name, schema in message_schemas().items():
-        described = {key for key, value in schema["properties"].items() if "description" in value}
-        inherited = {"version"} & set(schema["properties"])
-        assert described | inherited | {"type"} >= set(schema["properties"]), name
+        described = {key for key, value in schema.get("properties", {}).items() if "description" in value}
+        inherited = {"version"} & set(schema.get("properties", {}))
+        assert described | inherited | {"type"} >= set(schema.get("properties", {})), name
 
 
-def test_the_page_names_every_message_and_key() -> None:
+def test_the_pages_name_every_message_and_key() -> None:
     page = (ROOT / "docs/reference/plant.md").read_text(encoding="utf-8")
-    for topic in TOPICS:
-        assert f"/{topic}`" in page, topic
+    for topic, kind in TOPICS.items():
+        assert f"`PREFIX/NAME/{topic}` | [{kind.__name__}](messages.md#{kind.__name__.lower()})" in page, topic
+    messages = run_path(str(ROOT / "tools/docs/schema_page.py"))["messages_markdown"]()
+    for kind in (MeasuredValue, *TOPICS.values()):
+        section = messages.partition(f"## {kind.__name__}\n")[2].partition("\n## ")[0]
+        assert all(f"| `{key}` |" in section for key in kind.__struct_fields__), kind
+    (settings_text,) = re.findall(r"```toml title=\"station.toml\"\n(.*?)```", page, re.DOTALL)
+    assert set(tomllib.loads(settings_text)) == set(PlantSettings.__struct_fields__) - {"folder"}
+    for name, table in (("mqtt", MqttTable), ("opcua", OpcuaTable), ("alarms", AlarmTable)):
+        assert set(tomllib.loads(settings_text)[name]) == set(table.__struct_fields__)
+
+
+def test_the_unit_and_the_roles() -> None:
+    unit = ROOT / "tools/container/arview-station.service"
+    assert "KillSignal=SIGINT" in unit.read_text() and "ExecStart=/opt/arview/bin/arview station" in unit.read_text()
+    roles = re.findall(r"^FROM base AS (\w+)$", (ROOT / "tools/container/Containerfile").read_text(), re.MULTILINE)
+    services = yaml.safe_load((ROOT / "tools/container/compose.yaml").read_text())["services"]
+    targets = {one["build"]["target"] for one in services.values() if "build" in one}
+    assert set(roles) == targets == {"station", "worker", "results"}
