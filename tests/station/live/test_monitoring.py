@@ -5,9 +5,11 @@ from __future__ import annotations
 import http.client
 import json
 from collections.abc import Iterator
+from dataclasses import replace
 
 import pytest
 
+from arview.station.live.options import RequestLimits
 from arview.station.live.security.addresses import LOOPBACK
 from helpers.live_client import Http, Running, running
 from helpers.live_sample import loader, options
@@ -49,18 +51,20 @@ def test_alive_and_ready_without_a_token(server: Running) -> None:
 
 
 @pytest.mark.slow
-def test_probes_do_not_use_up_the_requests_of_others(server: Running) -> None:
-    connection, answers = http.client.HTTPConnection(LOOPBACK, server.port, timeout=10), []
-    for _ in range(300):
-        connection.request("GET", "/health")
-        answer = connection.getresponse()
-        answers.append(answer.status)
-        answer.read()
-    connection.close()
-    assert answers[:50] == [200] * 50 and 429 in answers
-    page = server.session()
-    assert page.ask("GET", "/api/part")[0] == 200
-    page.close()
+def test_probes_do_not_use_up_the_requests_of_others() -> None:
+    chosen = replace(options(max_age_s=None, clients=4), requests=RequestLimits())
+    with running(chosen, loader(chosen)) as server:
+        page = server.session()
+        connection, answers = http.client.HTTPConnection(LOOPBACK, server.port, timeout=10), []
+        for _ in range(300):
+            connection.request("GET", "/health")
+            answer = connection.getresponse()
+            answers.append(answer.status)
+            answer.read()
+        connection.close()
+        assert answers[:50] == [200] * 50 and 429 in answers
+        assert page.ask("GET", "/api/part")[0] == 200
+        page.close()
 
 
 @pytest.mark.slow
