@@ -107,6 +107,15 @@ def test_health_ready_and_metrics(plant: Plant) -> None:
     assert len(kinds) == len(set(kinds)) == 8
 
 
+def test_a_station_without_outlets(tmp_path: Path) -> None:
+    with Plant(settings(tmp_path, 'name = "cell-3"\n'), tmp_path) as alone:
+        assert alone.publish(result(1)) and not alone.publish(result(1))
+        alone.set_state("ready")
+        alone.take(b'{"id": "7"}')
+        assert alone.next_trigger(1.0) == Trigger(id="7")
+        assert (alone.health()["outlets"], alone.health()["cycle"]) == ({}, 1)
+
+
 def test_triggers(plant: Plant) -> None:
     http = client(plant)
     plant.set_state("ready")

@@ -263,8 +263,8 @@ def open_shares(
     """
     found: dict[tuple[str, Quantity], tuple[int, int]] = {}
     counted = (results.c.part == part, results.c.station == station, results.c.measured >= stamp(since))
-    tables: tuple[tuple[sa.Table, Quantity], ...] = ((components, "distance"), (characteristics, "characteristic"))
-    for table, quantity in tables:
+    names: tuple[Quantity, ...] = ("distance", "characteristic")
+    for table, quantity in zip((components, characteristics), names, strict=True):
         is_open = sa.case((table.c.verdict.in_(("undecided", "not_measured")), 1), else_=0)
         query = sa.select(table.c.name, sa.func.sum(is_open), sa.func.count()).join(results).where(*counted)
         query = query.where(results.c.id.not_in(sa.select(voids.c.result_id))).group_by(table.c.name)

@@ -38,12 +38,10 @@ def plant_routes(plant: Plant, token: str = "") -> list[Route]:
             return JSONResponse({"error": str(error)}, 400)
         return JSONResponse({"is_taken": True}, 202)
 
-    mqtt, name = plant.settings.mqtt, plant.settings.name
-    document = openapi(f"{'arview' if mqtt is None else mqtt.prefix}/{name}")
+    document = openapi(plant.settings.topic)
     no_token = JSONResponse({"error": "expected Authorization: Bearer TOKEN"}, 401, {"WWW-Authenticate": "Bearer"})
-    alive = {"status": "alive"}
     return [
-        Route("/health", lambda request: JSONResponse(plant.health() if is_known(request) else alive)),
+        Route("/health", lambda request: JSONResponse(plant.health() if is_known(request) else {"status": "alive"})),
         Route("/ready", lambda _: JSONResponse({"is_ready": plant.is_ready}, 200 if plant.is_ready else 503)),
         Route("/metrics", lambda request: PlainTextResponse(plant.metrics()) if is_known(request) else no_token),
         Route("/schema", lambda _: JSONResponse(document)),

@@ -36,14 +36,14 @@ class _BrokerClient(aiomqtt.Client):
 
     def _on_publish(self, client: Any, userdata: Any, mid: int, reason_code: Any, properties: Any) -> None:
         if getattr(reason_code, "is_failure", False):
-            self.refusal = str(reason_code)
+            self.refusal = f"the broker refused a message ({reason_code})"
         super()._on_publish(client, userdata, mid, reason_code, properties)
 
     async def send(self, topic: str, body: bytes, retain: bool = False) -> None:
         """Publish a message and wait until the broker has it. Raises MqttError if it does not take it."""
         await self.publish(topic, body, qos=1, retain=retain)
         if self.refusal:
-            raise aiomqtt.MqttError(f"the broker refused a message on {topic} ({self.refusal})")
+            raise aiomqtt.MqttError(self.refusal)
 
 
 class MqttLink(Outlet):
@@ -65,7 +65,6 @@ class MqttLink(Outlet):
     ) -> None:
         super().__init__("mqtt")
         self._settings, self._outbox, self._state, self._take = settings, outbox, state, take
-        self._base = f"{settings.mqtt.prefix if settings.mqtt else ''}/{settings.name}"
 
     async def run(self) -> None:
         """Connect, and send and receive until the connection breaks or the task is cancelled.
@@ -77,19 +76,23 @@ class MqttLink(Outlet):
         async with self._client() as client:
             self.is_connected, self.error = True, ""
             # What was retained is not wanted: the part of that trigger is no longer in the station.
-            await client.subscribe(f"{self._base}/triggers", options=SubscribeOptions(qos=1, retainHandling=2))
+            await client.subscribe(
+                f"{self._settings.topic}/triggers", options=SubscribeOptions(qos=1, retainHandling=2)
+            )
 
             async def send(message: PendingMessage) -> None:
-                await client.send(f"{self._base}/{message.topic}", message.body)
+                await client.send(f"{self._settings.topic}/{message.topic}", message.body)
 
             try:
                 async with asyncio.TaskGroup() as tasks:
                     tasks.create_task(self._receive(client))
                     tasks.create_task(self._tell_state(client))
                     tasks.create_task(self.deliver(self._outbox, send))
+            except ExceptionGroup as group:  # a broker may also end the connection after a refusal
+                raise aiomqtt.MqttError(client.refusal or str(group.exceptions[0])) from group
             except asyncio.CancelledError:
                 with suppress(aiomqtt.MqttError):
-                    await client.send(f"{self._base}/state", self._offline("stopped"), retain=True)
+                    await client.send(f"{self._settings.topic}/state", self._offline("stopped"), retain=True)
                 raise
 
     def _client(self) -> _BrokerClient:
@@ -105,7 +108,9 @@ class MqttLink(Outlet):
             # Under the same name a new connection ends the old one, whose last will is thus published before its state.
             identifier=f"arview-{self._settings.name}",
             protocol=aiomqtt.ProtocolVersion.V5,
-            will=aiomqtt.Will(f"{self._base}/state", self._offline("the connection was lost"), qos=1, retain=True),
+            will=aiomqtt.Will(
+                f"{self._settings.topic}/state", self._offline("the connection was lost"), qos=1, retain=True
+            ),
             timeout=TIMEOUT_S,
             keepalive=KEEP_ALIVE_S,
             tls_context=ssl.create_default_context(cafile=ca_file) if chosen.tls else None,
@@ -119,7 +124,7 @@ class MqttLink(Outlet):
         while True:
             state = self._state()
             if state != told:
-                await client.send(f"{self._base}/state", msgspec.json.encode(state), retain=True)
+                await client.send(f"{self._settings.topic}/state", msgspec.json.encode(state), retain=True)
                 told = state
             await self.await_news()
 
@@ -131,4 +136,4 @@ class MqttLink(Outlet):
             except InputError as error:
                 beginning, topic = content[:200].decode("utf-8", "replace"), str(message.topic)
                 refused = RefusedMessage(station=self._settings.name, topic=topic, reason=str(error), content=beginning)
-                await client.send(f"{self._base}/errors", msgspec.json.encode(refused))
+                await client.send(f"{self._settings.topic}/errors", msgspec.json.encode(refused))

@@ -87,23 +87,28 @@ class Outbox:
 
     def pending(self, outlet: str, count: int) -> list[PendingMessage]:
         """The oldest messages that an outlet has to send now."""
-        query = (
+        rows = self._rows(
             "SELECT number, key, topic, body, tries FROM deliveries JOIN messages USING (number)"
-            " WHERE outlet = ? AND closed IS NULL AND due <= ? ORDER BY number LIMIT ?"
+            " WHERE outlet = ? AND closed IS NULL AND due <= ? ORDER BY number LIMIT ?",
+            (outlet, time.time(), count),
         )
-        return [PendingMessage(*row) for row in self._rows(query, (outlet, time.time(), count))]
+        return [PendingMessage(*row) for row in rows]
 
     def confirm(self, outlet: str, number: int, refusal: str | None = None) -> None:
         """Note that an outlet has delivered a message; or that it was refused for good, and why."""
         with self._writing() as connection:
-            row = (time.time(), refusal, outlet, number)
-            connection.execute("UPDATE deliveries SET closed = ?, refusal = ? WHERE outlet = ? AND number = ?", row)
+            connection.execute(
+                "UPDATE deliveries SET closed = ?, refusal = ? WHERE outlet = ? AND number = ?",
+                (time.time(), refusal, outlet, number),
+            )
 
     def defer(self, outlet: str, number: int, delay_s: float) -> None:
         """Note that a message could not be delivered and is tried again after some time."""
         with self._writing() as connection:
-            row = (time.time() + delay_s, outlet, number)
-            connection.execute("UPDATE deliveries SET tries = tries + 1, due = ? WHERE outlet = ? AND number = ?", row)
+            connection.execute(
+                "UPDATE deliveries SET tries = tries + 1, due = ? WHERE outlet = ? AND number = ?",
+                (time.time() + delay_s, outlet, number),
+            )
 
     def counts(self) -> dict[str, dict[str, Any]]:
         """By outlet, those that are no longer configured included: messages pending, age of the oldest, and refused."""

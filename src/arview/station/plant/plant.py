@@ -79,7 +79,9 @@ class Plant:
             endpoint = settings.opcua.endpoint
             self._outlets.append(OpcuaView(endpoint, lambda: self.state, lambda: self._result, self.take))
         self._loop, self._tasks = asyncio.new_event_loop(), list[asyncio.Task[None]]()
-        self._thread = threading.Thread(target=self._run, name="plant", daemon=True)
+        self._thread = threading.Thread(
+            target=lambda: self._loop.run_until_complete(self._serve()), name="plant", daemon=True
+        )
 
     def __enter__(self) -> Plant:
         self._tasks = [self._loop.create_task(self._keep(outlet)) for outlet in self._outlets]
@@ -153,11 +155,10 @@ class Plant:
             part: name of the part, if it is of a part.
         """
         now, alarm_id = datetime.now(UTC), f"{kind}/{part}/{component}"
-        alarm = Alarm(
+        is_change = self._outbox.set_alarm(Alarm(
             key=content_hash([self.settings.name, alarm_id, now.isoformat()]), id=alarm_id, station=self.settings.name,
             kind=kind, severity=severity, part=part, component=component, text=text, since=now, is_active=bool(text),
-        )  # fmt: skip
-        is_change = self._outbox.set_alarm(alarm)
+        ))  # fmt: skip
         self._wake()
         return is_change
 
@@ -215,8 +216,8 @@ class Plant:
         for outlet in self._outlets:
             self._loop.call_soon_threadsafe(outlet.news.set)
 
-    def _run(self) -> None:
-        self._loop.run_until_complete(asyncio.gather(*self._tasks, return_exceptions=True))
+    async def _serve(self) -> None:
+        await asyncio.gather(*self._tasks, return_exceptions=True)
 
     async def _keep(self, outlet: Outlet) -> None:
         """Run an outlet, again whenever it breaks."""
@@ -225,8 +226,7 @@ class Plant:
             try:
                 await outlet.run()
             except Exception as error:  # no fault of a connection may stop the station
-                first = error.exceptions[0] if isinstance(error, ExceptionGroup) else error
-                outlet.error = without_credentials(str(first)) or type(first).__name__
+                outlet.error = without_credentials(str(error)) or type(error).__name__
                 logger.warning("%s: %s", outlet.name, outlet.error)
             pause_s = MIN_PAUSE_S if outlet.is_connected else min(2.0 * pause_s, MAX_PAUSE_S)
             outlet.is_connected = False

@@ -80,6 +80,11 @@ class PlantSettings(_Table, frozen=True, kw_only=True):
     opcua: OpcuaTable | None = None
     alarms: AlarmTable = AlarmTable()
 
+    @property
+    def topic(self) -> str:
+        """Beginning of the topics of this station."""
+        return f"{'arview' if self.mqtt is None else self.mqtt.prefix}/{self.name}"
+
     def secret(self, file: str | None) -> str | None:
         """The text of a file with a password or token, without the end of the line; None without a file.
 
