@@ -203,3 +203,22 @@ def test_user_and_password_are_needed_and_never_shown(tmp_path: Path) -> None:
             plant.publish(result(1))
             wait(lambda: consumer.result_keys() == [result(1).key])
             assert secret not in str(plant.health()) + plant.metrics()
+
+
+@pytest.mark.slow
+def test_tls_with_a_certificate_that_is_checked(tmp_path: Path) -> None:
+    made = subprocess.run(
+        ["openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "2", "-subj", "/CN=broker",
+         "-addext", "subjectAltName=IP:127.0.0.1", "-keyout", tmp_path / "key.pem", "-out", tmp_path / "cert.pem"],
+        capture_output=True,
+    )  # fmt: skip
+    if made.returncode:
+        pytest.skip("openssl cannot be run")
+    lines = (f"certfile {tmp_path / 'cert.pem'}", f"keyfile {tmp_path / 'key.pem'}")
+    with broker(tmp_path, *lines) as port:
+        with Plant(mqtt_settings(tmp_path, port, "tls = true\n"), tmp_path) as plant:
+            plant.publish(result(1))
+            wait(lambda: "certificate verify failed" in plant.health()["outlets"]["mqtt"]["error"])
+            assert pending(plant) == 1
+        with Plant(mqtt_settings(tmp_path, port, 'tls = true\nca_file = "cert.pem"\n'), tmp_path) as plant:
+            wait(lambda: pending(plant) == 0)
