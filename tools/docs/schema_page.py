@@ -46,6 +46,11 @@ def messages_markdown() -> str:
     from arview.station.plant.schema import message_schemas
 
     schemas = message_schemas()
+    for one in schemas.values():
+        for key, value in one.get("properties", {}).items():
+            named = schemas.get(value.get("$ref", "").rsplit("/", 1)[-1], {})
+            if "enum" in named:  # it has no section of its own
+                one["properties"][key] = {"enum": named["enum"], "description": value.get("description", "")}
     return _MESSAGES + "\n".join(_section(name, one) for name, one in schemas.items() if "properties" in one)
 
 
@@ -76,7 +81,7 @@ def _inner_object(value: dict[str, Any]) -> dict[str, Any] | None:
 def _type(value: dict[str, Any]) -> str:
     if "$ref" in value:
         name = value["$ref"].rsplit("/", 1)[-1]
-        return {"length": "number ≥ 0", "matrix": "matrix"}.get(name, f"[{name}](#{name})")
+        return {"length": "number ≥ 0", "matrix": "matrix"}.get(name, f"[{name}](#{name.lower()})")
     if "const" in value:
         return f"`{json.dumps(value['const'])}`"
     if "enum" in value:
