@@ -33,6 +33,7 @@ def series(values: np.ndarray, uncertainties: np.ndarray | None = None) -> Compo
     return ComponentSeries("p", "c", "distance", "mm", found, None, None, (), True)
 
 
+@pytest.mark.slow
 def test_a_shift_a_growing_uncertainty_and_missing_decisions() -> None:
     random = np.random.default_rng(7)
     calm = series(random.normal(0.3, 0.01, 50), random.normal(0.05, 0.004, 50))
