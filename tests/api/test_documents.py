@@ -19,7 +19,7 @@ LINK = re.compile(r"\]\(([^)#\s]+)(?:#([^)\s]+))?\)")
 FILE = re.compile(r"`((?:src|tests|tools|samples|docs)/[\w./-]+\.\w+)`")
 
 
-GENERATED = {"commands.md", "part-file.md", "inspection-json.md", "api.md"}
+GENERATED = {"commands.md", "part-file.md", "inspection-json.md", "api.md", "messages.md"}
 """Pages of the reference that the site makes from the program (`tools/docs/hooks.py`)."""
 
 

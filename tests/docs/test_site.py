@@ -112,6 +112,6 @@ def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("page", [*PAGES, *sorted(ROOT.glob("*.md"))], ids=lambda page: str(page.relative_to(ROOT)))
 def test_links_lead_to_files_of_the_repository(page: Path) -> None:
-    made = {"commands.md", "part-file.md", "inspection-json.md", "api.md"}
+    made = {"commands.md", "part-file.md", "inspection-json.md", "api.md", "messages.md"}
     for link in LINK.findall(page.read_text()):
         assert Path(link).name in made or (page.parent / link).exists(), f"{page.name}: {link}"

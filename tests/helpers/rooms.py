@@ -37,7 +37,7 @@ ROOMS = (
     ("quality.rework", "quality.decisions"),
     ("report", "quality.history", "calibration", "acceptance"),
     ("workflow",),
-    ("quality.batch", "station.capture", "station.rig"),
+    ("quality.batch", "station.capture", "station.rig", "station.plant"),
     ("station.walk",),
     ("station.live",),
     ("station.studio",),

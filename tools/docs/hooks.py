@@ -42,7 +42,9 @@ def generated_pages() -> Iterator[tuple[str, str]]:
         "# Part file\n\nA part file adds to a CAD file what it does not say. All but `cad` has a default. Keys that "
         f"are not known are an error.\n\n```toml\n{PART_FILE_EXAMPLE}```\n",
     )
-    yield "reference/inspection-json.md", run_path(str(Path(__file__).with_name("schema_page.py")))["schema_markdown"]()
+    pages = run_path(str(Path(__file__).with_name("schema_page.py")))
+    yield "reference/inspection-json.md", pages["schema_markdown"]()
+    yield "reference/messages.md", pages["messages_markdown"]()
     yield "reference/api.md", "\n".join(api_page())
 
 

@@ -1,4 +1,4 @@
-"""The JSON Schema of ``inspection.json`` as a Markdown page."""
+"""The JSON Schemas of ``inspection.json`` and of the messages of the plant as Markdown pages."""
 
 from __future__ import annotations
 
@@ -32,6 +32,28 @@ def schema_markdown() -> str:
     return _INTRODUCTION.format(version=SCHEMA_VERSION) + "\n".join(sections)
 
 
+_MESSAGES = """# Messages of the plant
+
+What a station sends and receives, see [the plant](plant.md). This page is generated from
+`src/arview/station/plant/messages.py`. Each message is a JSON object; keys that are not listed are an error. Lengths
+are in millimetres, times UTC in ISO 8601. A key that changes its meaning changes `version`.
+
+"""
+
+
+def messages_markdown() -> str:
+    """The page of the messages: a section with a table of the keys for each."""
+    from arview.station.plant.schema import message_schemas
+
+    schemas = message_schemas()
+    for one in schemas.values():
+        for key, value in one.get("properties", {}).items():
+            named = schemas.get(value.get("$ref", "").rsplit("/", 1)[-1], {})
+            if "enum" in named:  # it has no section of its own
+                one["properties"][key] = {"enum": named["enum"], "description": value.get("description", "")}
+    return _MESSAGES + "\n".join(_section(name, one) for name, one in schemas.items() if "properties" in one)
+
+
 def _section(title: str, definition: dict[str, Any]) -> str:
     lines = [f"## {title}", ""]
     if definition.get("description"):
@@ -59,7 +81,7 @@ def _inner_object(value: dict[str, Any]) -> dict[str, Any] | None:
 def _type(value: dict[str, Any]) -> str:
     if "$ref" in value:
         name = value["$ref"].rsplit("/", 1)[-1]
-        return {"length": "number ≥ 0", "matrix": "matrix"}.get(name, f"[{name}](#{name})")
+        return {"length": "number ≥ 0", "matrix": "matrix"}.get(name, f"[{name}](#{name.lower()})")
     if "const" in value:
         return f"`{json.dumps(value['const'])}`"
     if "enum" in value:

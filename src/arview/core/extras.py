@@ -27,6 +27,7 @@ MODULES: dict[str, dict[str, str]] = {
         "aiortc": "aiortc", "cryptography": "cryptography", "h11": "h11", "ifaddr": "ifaddr", "segno": "segno",
         "starlette": "Starlette", "tomlkit": "tomlkit", "uvicorn": "uvicorn",
     },
+    "plant": {"aiomqtt": "aiomqtt", "asyncua": "asyncua", "msgspec": "msgspec"},
     "quality": {"sqlalchemy": "SQLAlchemy"},
     "postgres": {"psycopg": "psycopg"},
     "batch": {"bokeh": "bokeh", "dask": "Dask", "distributed": "Dask", "fsspec": "fsspec", "tornado": "tornado"},

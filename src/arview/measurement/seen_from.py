@@ -7,9 +7,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from arview import reconstruction
 from arview.cad import Model
 from arview.inspection import ComponentDeviation, Details, Finding, ForeignReport, MeasuredPresence, Verdict
-from arview.reconstruction import DIRECTIONS_WANTED, PHOTOS_WANTED, ComponentCoverage, Consistency, SparseModel
+from arview.reconstruction import Consistency, SparseModel
 from arview.reconstruction.coverage import coverage
 
 HIDDEN_EDGES = 0.25
@@ -24,7 +25,7 @@ FOREIGN_MARGIN_MM = 4.0
 class SeenFrom:
     """Photos and directions from which each component is seen, and the options by which they are few."""
 
-    components: Mapping[str, ComponentCoverage]
+    components: Mapping[str, reconstruction.ComponentCoverage]
 
 
 def seen_from(sparse: SparseModel, model: Model) -> SeenFrom:
@@ -97,12 +98,12 @@ def with_hidden(record: ComponentDeviation, note: str) -> ComponentDeviation:
     )
 
 
-def _few(covered: ComponentCoverage, is_measured: bool) -> str:
+def _few(covered: reconstruction.ComponentCoverage, is_measured: bool) -> str:
     """Why the photos of a component are too few; empty if they are not."""
     photos = len(covered.photos)
     if photos == 0:
         return "no photo shows enough of it: other components hide it, or it is outside the pictures"
-    if photos >= PHOTOS_WANTED and covered.directions >= DIRECTIONS_WANTED:
+    if photos >= reconstruction.PHOTOS_WANTED and covered.directions >= reconstruction.DIRECTIONS_WANTED:
         return ""
     places = f"{covered.directions} direction{'s' * (covered.directions != 1)}"
     text = f"only {photos} photo{'s' * (photos != 1)} from {places} show{'s' * (photos == 1)} it"

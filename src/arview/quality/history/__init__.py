@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from arview.quality.history.series import ComponentSeries as ComponentSeries
     from arview.quality.history.series import SeriesValue as SeriesValue
     from arview.quality.history.series import limits_text as limits_text
+    from arview.quality.history.series import open_shares as open_shares
     from arview.quality.history.series import series_of as series_of
     from arview.quality.history.statistics import Capability as Capability
     from arview.quality.history.statistics import ControlChart as ControlChart
@@ -55,6 +56,7 @@ __getattr__, __dir__, __all__ = lazy_door(
             "ComponentSeries",
             "SeriesValue",
             "limits_text",
+            "open_shares",
             "series_of",
         ),
         "statistics": (

@@ -254,6 +254,24 @@ def series_of(
     )
 
 
+def open_shares(
+    store: HistoryStore, part: str, station: str, since: datetime
+) -> dict[tuple[str, Quantity], tuple[int, int]]:
+    """How many results have no decision (undecided, not measured) since then, and how many there are.
+
+    They are by the name of the component or characteristic and the quantity of its series.
+    """
+    found: dict[tuple[str, Quantity], tuple[int, int]] = {}
+    counted = (results.c.part == part, results.c.station == station, results.c.measured >= stamp(since))
+    names: tuple[Quantity, ...] = ("distance", "characteristic")
+    for table, quantity in zip((components, characteristics), names, strict=True):
+        is_open = sa.case((table.c.verdict.in_(("undecided", "not_measured")), 1), else_=0)
+        query = sa.select(table.c.name, sa.func.sum(is_open), sa.func.count()).join(results).where(*counted)
+        query = query.where(results.c.id.not_in(sa.select(voids.c.result_id))).group_by(table.c.name)
+        found |= {(row[0], quantity): (int(row[1]), int(row[2])) for row in store.rows(query)}
+    return found
+
+
 def _only_part(store: HistoryStore) -> str:
     parts = sorted(str(row.part) for row in store.rows(sa.select(results.c.part).distinct()))
     if len(parts) > 1:

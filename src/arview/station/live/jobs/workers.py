@@ -115,6 +115,11 @@ class WorkerQueue:
                 return "running"
             return "failed" if entry.breaks > len(WORKER_PAUSES_S) else "waiting"
 
+    @property
+    def pending(self) -> int:
+        """Number of jobs that are measured or wait for photos or a worker."""
+        return len(self._entries)
+
     def tick(self) -> None:
         """Notice which workers have ended, make room, start others. To be called about twice a second, in a thread."""
         with self._lock:

@@ -22,6 +22,8 @@ from arview.station.live.security.refusals import Refusal
 
 PAGES = ("/", "/watch")
 """Paths whose query may carry the token."""
+PROBES = ("/health", "/ready")
+"""Paths that need no token: they tell no more than that the server is there."""
 POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; connect-src 'self'; "
     "media-src 'self' blob: mediastream:; worker-src 'self' blob:; font-src 'self'; manifest-src 'self'; "
@@ -140,15 +142,16 @@ class Gate:
             await send(message)
 
         address, port = scope.get("client") or ("?", 0)
+        is_probe = scope["path"] in PROBES and scope["method"] in ("GET", "HEAD")
         try:
             try:
                 self._check_host(headers)
-                cookie += await self._check_token(scope, headers)
+                cookie += [] if is_probe else await self._check_token(scope, headers)
             except Refusal:
                 self._unauthenticated_rate.check(str(address))
                 raise
-            self._rate.check(str(address))
-            if self._connections is not None:
+            (self._unauthenticated_rate if is_probe else self._rate).check(str(address))
+            if self._connections is not None and not is_probe:
                 self._connections.show_token((str(address), int(port)), scope.get(DEVICE) or str(address))
             self._check_origin(scope, headers)
         except Refusal as refusal:

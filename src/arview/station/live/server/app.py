@@ -28,6 +28,7 @@ from arview.station.live.server.annotated_png import annotated_png
 from arview.station.live.server.clients import Client
 from arview.station.live.server.hub import Hub
 from arview.station.live.server.jobs_api import BODY_TIMEOUT_S, JobHandlers
+from arview.station.live.server.monitoring import monitoring_routes
 from arview.station.live.server.station_api import StationHandlers, keep_snapshot
 from arview.station.live.server.workers import StuckError
 from arview.station.live.stream.documents import Document
@@ -79,6 +80,7 @@ def make_app(hub: Hub, access: Access, connections: ConnectionTable | None = Non
         Route(f"{client}/frame", handlers.give_frame),
         Route(f"{client}/snapshot.png", handlers.annotated_png),
         Route(f"{client}/snapshots", handlers.keep_snapshot, methods=["POST"]),
+        *monitoring_routes(hub),
         *StationHandlers(hub).routes,
         *JobHandlers(hub).routes,
     ]
