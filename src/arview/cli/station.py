@@ -3,20 +3,31 @@
 from __future__ import annotations
 
 import tempfile
+import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from arview import calibration
 from arview.cli.common import main, progress_bar, say
 from arview.cli.exit_codes import ExitCode, exit_code_of
+from arview.core.extras import require_extra
 from arview.core.progress import check_stop
 from arview.errors import InputError
 from arview.fiducials import parse_board
 from arview.inspection import overall_verdict, verdict_sentence
 from arview.station import rig as cell
 
+if TYPE_CHECKING:
+    from arview.quality import history
+    from arview.station import plant
+
+INLETS = ("mqtt", "opcua", "http")
+"""Tables of a station file by which triggers come."""
 _GRADES = {"good": ExitCode.DONE, "usable": ExitCode.UNDECIDED, "not enough": ExitCode.FAIL}
 
 
@@ -103,8 +114,12 @@ def check(path: str | None, shows_example: bool) -> None:
     if path is None:
         raise InputError("expected a station file; `arview station check --example` prints one")
     setup = cell.read_station(path)
+    settings = _plant_of(setup)
     setup.table.finish()
     click.echo(f"{setup.name}: part {setup.part.name}, {len(setup.cameras)} cameras, cycles in {setup.cycles}")
+    if settings is not None:
+        outlets = [name for name in (*INLETS, "hooks") if name in setup.table.content]
+        click.echo(f"results and triggers by {', '.join(outlets)}")
     if not setup.rig_path.is_file():
         click.echo(f"{setup.rig_path}: not there yet; run `arview station calibrate {path}`")
         click.get_current_context().exit(ExitCode.FAIL)
@@ -138,36 +153,112 @@ Examples:
 )
 @click.option("--serial", metavar="NUMBER", help="Serial number of the part, with --cycles 1.")
 def run(path: str, cycles: int | None, interval_s: float | None, serial: str | None) -> None:
-    """Measure one part after another under the cameras of STATION; each cycle has a folder with its files."""
+    """Measure one part after another under the cameras of STATION; each cycle has a folder with its files.
+
+    With [mqtt], [opcua] or [http] in the file a trigger from there begins a cycle, and its result goes to all outlets.
+    """
     setup = cell.read_station(path)
+    settings = _plant_of(setup)
     setup.table.finish()
     if serial is not None and cycles != 1:
         raise InputError("--serial is of one part: give it with --cycles 1")
     measuring = cell.Cell(setup)
+    waits_for_line = interval_s is None and cycles is None and any(name in setup.table.content for name in INLETS)
     verdict, done = "not_measured", 0
-    with cell.RigCameras(setup.cameras) as cameras:
+    with cell.RigCameras(setup.cameras) as cameras, _line(setup, settings) as line:
         while cycles is None or done < cycles:
-            check_stop()
-            if interval_s is None and cycles is None:
+            trigger = None
+            if waits_for_line and line is not None:
+                line.set_state("ready")
+                while (trigger := line.next_trigger(0.5)) is None:
+                    check_stop()
+                line.set_state("busy")
+            elif interval_s is None and cycles is None:
                 click.prompt("Enter measures the next part", default="", show_default=False, prompt_suffix="", err=True)
             elif done:
                 _wait(interval_s or 0.0)
             try:
-                cycle = measuring.cycle(cameras, serial)
+                cycle = measuring.cycle(cameras, serial if trigger is None else trigger.serial or None)
             except InputError as error:
                 if done == 0:
                     raise
                 say(str(error))
                 break
             done += 1
+            _tell(setup, line, cycle, trigger)
             verdict = overall_verdict(cycle.inspection).value
-            click.echo(
-                f"{cycle.folder.name}: {verdict_sentence(cycle.inspection)} ({sum(cycle.seconds.values()):.1f} s)"
-            )
-            for warning in cycle.inspection.warnings:
-                say(warning)
             measuring.draw(cycle)
     click.get_current_context().exit(exit_code_of(verdict))
+
+
+def _plant_of(setup: cell.Station) -> Any:
+    """The settings of the outlets of a station file (`plant.read_plant`); None where it has none."""
+    if not any(name in setup.table.content for name in (*INLETS, "hooks", "alarms")):
+        return None
+    require_extra("what a station tells the line", "plant")
+    from arview.station import plant
+
+    return plant.read_plant(setup.table)
+
+
+@contextmanager
+def _line(setup: cell.Station, settings: Any) -> Iterator[plant.Plant | None]:
+    """The open outlets, and the server for triggers and monitors."""
+    if settings is None:
+        yield None
+        return
+    from arview.station import plant
+
+    with plant.Plant(settings, setup.cycles) as line:
+        server = None
+        if setup.http is not None:
+            import uvicorn
+            from starlette.applications import Starlette
+
+            address, port, token = setup.http
+            app = Starlette(routes=plant.plant_routes(line, token))
+            server = uvicorn.Server(uvicorn.Config(app, address, port, log_level="warning", lifespan="off"))
+            threading.Thread(target=server.run, name="arview-http", daemon=True).start()
+        try:
+            yield line
+        finally:
+            line.set_state("halted")
+            if server is not None:
+                server.should_exit = True
+
+
+def _tell(setup: cell.Station, line: plant.Plant | None, cycle: cell.Cycle, trigger: plant.Trigger | None) -> None:
+    """Print the result of a cycle, and tell it to the outlets and the store, with the alarms that follow from it."""
+    seconds = sum(cycle.seconds.values())
+    click.echo(f"{cycle.folder.name}: {verdict_sentence(cycle.inspection)} ({seconds:.1f} s)")
+    for warning in cycle.inspection.warnings:
+        say(warning)
+    with _store(setup) as kept:
+        if kept is not None:
+            kept.add(cycle.folder / "inspection.json", station=setup.name)
+        if line is None:
+            return
+        from arview.station import plant
+
+        line.publish(plant.result_of(cycle.inspection, setup.name, trigger))
+        for name in (one.name for one in setup.cameras):
+            text = next((one for one in cycle.inspection.warnings if one.startswith(f"camera {name}")), "")
+            line.set_alarm("camera_moved", name, text, "error")
+        if kept is not None:
+            for text in line.check_history(kept, setup.part.name):
+                say(text)
+
+
+@contextmanager
+def _store(setup: cell.Station) -> Iterator[history.HistoryStore | None]:
+    """The store of the station, if it has one."""
+    if not setup.store:
+        yield None
+        return
+    from arview.quality import history
+
+    with history.HistoryStore(setup.store, tell=say) as store:
+        yield store
 
 
 def _print(found: calibration.CameraRig) -> str:

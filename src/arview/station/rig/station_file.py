@@ -7,7 +7,8 @@ import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 
-from arview.cad import Part, TomlTable, load_part
+from arview import cad
+from arview.cad import Part, load_part
 from arview.camera import Camera, load_camera
 from arview.errors import InputError
 from arview.video import check_source
@@ -19,6 +20,7 @@ part = "part.toml"             # part file or CAD file
 rig = "rig.json"               # poses of the cameras; `arview station calibrate` writes it
 cycles = "cycles"              # folder of the results, one folder for each cycle
 keep = 200                     # cycles that are kept; older ones are removed
+# store = "history.sqlite"     # store of `arview history`, file or URL, to which each result is added
 
 [[cameras]]
 name = "north"
@@ -30,6 +32,22 @@ burst = 4                      # pictures that are averaged, against noise; defa
 name = "south"
 source = "rtsp://10.0.4.12/1"
 camera = "south.json"
+
+# … and one more at least. What follows is for the line; see docs/reference/plant.md. Without it Enter measures.
+# [http]                       # triggers, /health, /ready, /metrics, /schema
+# port = 8080
+# address = "0.0.0.0"          # default: 127.0.0.1; all others need a token
+# token_file = "token.txt"
+#
+# [mqtt]
+# host = "broker.local"
+#
+# [[hooks]]
+# name = "mes"
+# url = "https://mes.local/results"
+#
+# [opcua]
+# endpoint = "opc.tcp://0.0.0.0:4840"
 """
 _NAME = re.compile(r"[\w-]{1,40}")
 MIN_CAMERAS = 3
@@ -58,6 +76,8 @@ class Station:
         rig_path: file of their poses, which need not exist yet.
         cycles: folder of the results.
         keep: number of cycles that are kept.
+        store: file or URL of the store to which results are added; empty: none.
+        http: address and port for triggers and monitors, and their token; None: there is no server.
         table: the whole file, from which other rooms read their tables; `finish` was not yet called.
     """
 
@@ -68,7 +88,9 @@ class Station:
     rig_path: Path
     cycles: Path
     keep: int
-    table: TomlTable
+    store: str
+    http: tuple[str, int, str] | None
+    table: cad.TomlTable
 
 
 def read_station(path: str | Path) -> Station:
@@ -84,7 +106,7 @@ def read_station(path: str | Path) -> Station:
         raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: is not a TOML file ({error})") from error
-    table = TomlTable(path, "", content)
+    table = cad.TomlTable(path, "", content)
     folder = path.parent
     cameras: list[RigCamera] = []
     for entry in table.tables("cameras"):
@@ -109,8 +131,29 @@ def read_station(path: str | Path) -> Station:
         rig_path=folder / table.text("rig", "rig.json"),
         cycles=folder / table.text("cycles", "cycles"),
         keep=int(keep),
+        store=table.text("store", ""),
+        http=_read_http(table),
         table=table,
     )
+
+
+def _read_http(root: cad.TomlTable) -> tuple[str, int, str] | None:
+    """Address, port and token of ``[http]``."""
+    table = root.table("http")
+    if not table.content:
+        return None
+    port, address = table.positive("port", required=True) or 0.0, table.line("address", "127.0.0.1")
+    if port != int(port) or port > 65535:
+        table.fail("port", port, "a port from 1 to 65535")
+    file = table.text("token_file", "")
+    table.finish()
+    try:
+        token = (root.path.parent / file).read_text(encoding="utf-8").strip() if file else ""
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{root.path}: [http] token_file: {file}: cannot be read ({error})") from error
+    if not token and address not in ("127.0.0.1", "::1", "localhost"):
+        raise InputError(f"{root.path}: [http] address {address}: others than this machine need a token_file")
+    return address, int(port), token
 
 
 def _located(folder: Path, source: str) -> str:
