@@ -143,7 +143,12 @@ Examples:
     },
 )
 @click.argument("path", metavar="STATION")
-@click.option("--cycles", type=click.IntRange(1), metavar="N", help="End after N cycles; without triggers: at once.")
+@click.option(
+    "--cycles",
+    type=click.IntRange(1),
+    metavar="N",
+    help="End after N cycles; where nothing triggers them, they begin at once.",
+)
 @click.option(
     "--every",
     "interval_s",
@@ -163,7 +168,7 @@ def run(path: str, cycles: int | None, interval_s: float | None, serial: str | N
     if serial is not None and cycles != 1:
         raise InputError("--serial is of one part: give it with --cycles 1")
     measuring = cell.Cell(setup)
-    waits_for_line = interval_s is None and cycles is None and any(name in setup.table.content for name in INLETS)
+    waits_for_line = interval_s is None and any(name in setup.table.content for name in INLETS)
     verdict, done = "not_measured", 0
     with cell.RigCameras(setup.cameras) as cameras, _line(setup, settings) as line:
         while cycles is None or done < cycles:
@@ -174,7 +179,7 @@ def run(path: str, cycles: int | None, interval_s: float | None, serial: str | N
                     check_stop()
                 line.set_state("busy")
             elif interval_s is None and cycles is None:
-                click.prompt("Enter measures the next part", default="", show_default=False, prompt_suffix="", err=True)
+                click.prompt("Enter measures the next part", "", show_default=False, prompt_suffix="", err=True)
             elif done:
                 _wait(interval_s or 0.0)
             try:

@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import json
+import subprocess
+import sys
+import urllib.error
+import urllib.request
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,7 +19,9 @@ from arview.cli import main
 from arview.errors import InputError
 from arview.geometry import rigid
 from arview.inspection import Verdict, load_inspection
+from arview.quality.history import HistoryStore
 from arview.station.rig import STATION_FILE_EXAMPLE, Cell, Cycle, RigCameras, read_station
+from helpers.plant_bench import answers, broker, consuming, free_port, needs_broker, wait
 from helpers.rig_cell import CAMERA, cell, names_of, true_mm, write_pictures, write_station
 
 pytestmark = pytest.mark.slow  # each cycle detects, places and measures
@@ -43,6 +50,17 @@ def station(tmp_path_factory: pytest.TempPathFactory) -> Path:
     moved = SCENE.rig_from_model @ rigid(np.eye(3), [6.0, -3.0, 0.0])
     write_pictures(folder, replace(SCENE, rig_from_model=moved), 2)
     return path
+
+
+def post(port: int, trigger: dict[str, str]) -> int:
+    """Status of the answer to a trigger."""
+    headers = {"Content-Type": "application/json"}
+    request = urllib.request.Request(f"http://127.0.0.1:{port}/triggers", json.dumps(trigger).encode(), headers)
+    try:
+        with urllib.request.urlopen(request, timeout=10.0) as answer:
+            return int(answer.status)
+    except urllib.error.HTTPError as error:
+        return error.code
 
 
 @pytest.fixture(scope="module")
@@ -108,6 +126,38 @@ def test_the_program_measures_one_part_and_says_its_verdict(station: Path) -> No
     assert "Z-B-7: 16 components" in result.output
     checked = CliRunner().invoke(main, ["station", "check", str(station)])
     assert checked.exit_code == 0 and "cell 4" in checked.output and "good: truth" in checked.output
+
+
+@needs_broker
+def test_the_line_triggers_and_is_told(station: Path, tmp_path: Path) -> None:
+    """A trigger by HTTP and one by MQTT, a camera that is turned in the second cycle: results, an alarm, the store."""
+    port, path = free_port(), station.with_name("line.toml")
+    with broker(tmp_path) as broker_port, consuming(broker_port) as consumer:
+        more = f'keep = 3\ncycles = "{tmp_path / "cycles"}"\nstore = "kept.sqlite"'
+        text = station.read_text().replace("keep = 3", more)
+        path.write_text(f'{text}\n[mqtt]\nhost = "127.0.0.1"\nport = {broker_port}\n[http]\nport = {port}\n')
+        command = [sys.executable, "-m", "arview", "station", "run", str(path), "--cycles", "2"]
+        program = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+        try:
+            wait(lambda: answers(port), 120.0)
+            wait(lambda: post(port, {"id": "t-1", "serial": "S-1"}) == 202, 60.0)
+            assert post(port, {"id": "t-2", "seriel": "S-2"}) == 400
+            wait(consumer.result_keys, 120.0)
+            consumer.publish("arview/cell 4/triggers", {"id": "t-3", "serial": "S-3", "order": "O-7"})
+            output, _ = program.communicate(timeout=120.0)
+        finally:
+            program.kill()
+        wait(lambda: len(set(consumer.result_keys())) == 2 and consumer.of("alarms"))
+        found, (alarm,) = consumer.of("results"), consumer.of("alarms")
+    assert [(one["serial"], one["order"], one["trigger"]) for one in found] == [
+        ("S-1", "", "t-1"),
+        ("S-3", "O-7", "t-3"),
+    ]
+    assert all(len(one["components"]) == 16 for one in found)
+    assert (alarm["kind"], alarm["component"], alarm["is_active"]) == ("camera_moved", "cam_2", True)
+    assert "camera cam_2 has moved" in output and program.returncode in (0, 1, 2), output
+    with HistoryStore(station.with_name("kept.sqlite")) as store:
+        assert sorted(one.serial for one in store.listed()) == ["S-1", "S-3"]
 
 
 @pytest.mark.parametrize(

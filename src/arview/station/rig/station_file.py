@@ -131,7 +131,7 @@ def read_station(path: str | Path) -> Station:
         rig_path=folder / table.text("rig", "rig.json"),
         cycles=folder / table.text("cycles", "cycles"),
         keep=int(keep),
-        store=table.text("store", ""),
+        store=_located(folder, store) if (store := table.text("store", "")) else "",
         http=_read_http(table),
         table=table,
     )
