@@ -35,6 +35,12 @@ class Presence(StrEnum):
     """Its nominal place was seen without it."""
     DISPLACED = "displaced"
     """Not seen at its nominal place but at another, see `ComponentPresence.model_from_nominal`."""
+    NEXT = "next"
+    """A step of the assembly that mounts it is to be done now."""
+    LATER = "later"
+    """A later step mounts it."""
+    WRONG = "wrong"
+    """It is to be mounted now, and something else stands at its place."""
 
 
 class Visibility(StrEnum):
@@ -93,6 +99,54 @@ class Identity(StrEnum):
     """A serial code in the picture names another specimen than the inspection: labels are withheld."""
 
 
+@dataclass(frozen=True)
+class StepReport:
+    """How far the assembly of a part is, by the steps of its part file; all tuples but the last two have one of each.
+
+    Attributes:
+        names, components: of the steps.
+        is_current: the step is to be done now: all before it are done.
+        started_s: time stamp of the frame since which it is to be done; None: not yet.
+        done_s: time stamp of the frame in which the last of its components was first seen; None: it is not done.
+        faults: what is wrong now, one sentence for each fault: wrong order, wrong part, or a component that is gone.
+        history: all faults so far, each with the time stamps at which it began and ended; None: it has not ended.
+    """
+
+    names: tuple[str, ...]
+    components: tuple[tuple[str, ...], ...]
+    is_current: tuple[bool, ...]
+    started_s: tuple[float | None, ...]
+    done_s: tuple[float | None, ...]
+    faults: tuple[str, ...] = ()
+    history: tuple[tuple[str, float, float | None], ...] = ()
+
+    @property
+    def text(self) -> str:
+        """What is to be done now, in one sentence, such as ``3/12 mount post_3``."""
+        count = len(self.names)
+        if False not in (is_done := [done_s is not None for done_s in self.done_s]):
+            return sentence("steps.done", count=count)
+        current = self.is_current.index(True) if True in self.is_current else is_done.index(False)
+        listed = ", ".join(self.components[current])
+        key = "steps.mount" if self.names[current] == listed else "steps.named"
+        return sentence(key, number=current + 1, count=count, names=listed, name=self.names[current])
+
+    def rows(self) -> list[dict[str, object]]:
+        """Each step as JSON values: number, name, components, state, started_s, done_s."""
+        columns = zip(self.names, self.components, self.is_current, self.started_s, self.done_s, strict=True)
+        return [
+            {
+                "step": number,
+                "name": name,
+                "components": list(components),
+                "state": "done" if done_s is not None else "current" if is_current else "locked",
+                "started_s": started_s,
+                "done_s": done_s,
+            }
+            for number, (name, components, is_current, started_s, done_s) in enumerate(columns, 1)
+        ]
+
+
 MAX_NAMES = 3
 """Unverified components listed by name in a status line; of more than these only the number is given."""
 
@@ -124,6 +178,7 @@ class Pose:
         identity_reason: why the identity is unconfirmed or another, in words that say what to do.
         serial: serial number read from a code on the part in view, or empty.
         instance: names the part and which specimen of it this is where several are tracked at once, or empty.
+        steps: of the assembly; None of a part without steps.
     """
 
     cam_from_model: Array | None
@@ -143,6 +198,7 @@ class Pose:
     identity_reason: str = ""
     serial: str = ""
     instance: str = ""
+    steps: StepReport | None = None
 
     def __repr__(self) -> str:
         if self.cam_from_model is None:
@@ -162,6 +218,7 @@ class Pose:
         Of a pose, ``presence`` maps each component to its `Presence`, ``presence_details`` to its visibility,
         probability, observations, spread_deg and, if it is displaced, model_from_nominal (4×4). ``completeness`` is a
         summary; ``identity``, ``identity_reason``, ``serial`` and ``instance`` say which specimen is meant.
+        ``steps``, of a part that has them, holds what is to be done (``text``) and what is wrong (``faults``).
         """
         covariance = None if self.covariance is None else self.covariance.tolist()
         if covariance is not None and not all(isfinite(value) for row in covariance for value in row):
@@ -179,6 +236,7 @@ class Pose:
             "unverified": list(self.unverified),
             "alternatives": [alternative.tolist() for alternative in self.alternatives],
             **self._specimen(),
+            **({} if self.steps is None else {"steps": {"text": self.steps.text, "faults": list(self.steps.faults)}}),
         }
 
     def _specimen(self) -> dict[str, object]:

@@ -19,6 +19,8 @@ MISSING_RGB: Rgb = (255, 72, 66)
 """Colour of the hatched ghost and the badge of a missing component."""
 DISPLACED_RGB: Rgb = (214, 122, 255)
 """Colour of both places of a displaced component."""
+NEXT_RGB: Rgb = (255, 236, 92)
+"""Colour of a component that is to be mounted now."""
 DIMMED_RGB: Rgb = (150, 158, 170)
 """Grey into which the colour of a verdict is mixed where the pictures do not support it."""
 PLAIN, STRIPES, CROSSES = 0, 1, 2
@@ -34,6 +36,8 @@ _DIMMED_OPACITY = 0.45
 """Factor of the opacity of components that the pictures do not verify."""
 _DIMMED_SHARE = 0.6
 """Share of grey in the colour of a dimmed verdict."""
+_NEXT_OPACITY = 0.6
+"""Opacity of the ghost of a component that is to be mounted now; nothing real is behind it but its bare place."""
 _HATCH_OPACITY = 0.75
 """Opacity of the lines of a hatched ghost: higher than of a plain one, because they cover little."""
 
@@ -49,6 +53,12 @@ class DrawnEvidence(StrEnum):
     DISPLACED = "displaced"
     WITHHELD = "withheld"
     """The part in view may be another specimen: nothing measured is shown."""
+    NEXT = "next"
+    """To be mounted now."""
+    LATER = "later"
+    """To be mounted later: not drawn."""
+    WRONG = "wrong"
+    """To be mounted now, and something else stands at its place."""
 
     @property
     def is_open(self) -> bool:
@@ -58,7 +68,12 @@ class DrawnEvidence(StrEnum):
     @property
     def is_refuted(self) -> bool:
         """Whether the component was seen not to be at its nominal place."""
-        return self in (DrawnEvidence.MISSING, DrawnEvidence.DISPLACED)
+        return self in (DrawnEvidence.MISSING, DrawnEvidence.DISPLACED, DrawnEvidence.WRONG)
+
+    @property
+    def is_awaited(self) -> bool:
+        """Whether the component is still to be mounted, and nothing is wrong with that."""
+        return self in (DrawnEvidence.NEXT, DrawnEvidence.LATER)
 
 
 _EVIDENCE = {
@@ -67,6 +82,9 @@ _EVIDENCE = {
     Presence.PRESENT: DrawnEvidence.SEEN,
     Presence.MISSING: DrawnEvidence.MISSING,
     Presence.DISPLACED: DrawnEvidence.DISPLACED,
+    Presence.NEXT: DrawnEvidence.NEXT,
+    Presence.LATER: DrawnEvidence.LATER,
+    Presence.WRONG: DrawnEvidence.WRONG,
 }
 
 
@@ -130,10 +148,12 @@ def component_styles(
         pattern = PLAIN
         if seen is DrawnEvidence.WITHHELD:
             color, opacity, edge_alpha = CONTEXT_RGB, 0.0, 1.0
+        elif seen.is_awaited:
+            color, opacity, edge_alpha, cost = NEXT_RGB, _NEXT_OPACITY, 1.0, 1.0
+            if seen is DrawnEvidence.LATER:
+                opacity = edge_alpha = cost = 0.0
         elif seen.is_refuted:
-            color, opacity = (
-                (MISSING_RGB, _HATCH_OPACITY) if seen is DrawnEvidence.MISSING else (DISPLACED_RGB, _HATCH_OPACITY)
-            )
+            color, opacity = DISPLACED_RGB if seen is DrawnEvidence.DISPLACED else MISSING_RGB, _HATCH_OPACITY
             pattern = CROSSES if seen is DrawnEvidence.MISSING else STRIPES
             edge_alpha, cost = 1.0, 1.0
         elif (seen.is_open or is_doubtful) and deviation is not None:
