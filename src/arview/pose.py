@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from math import isfinite
 from types import MappingProxyType
 from typing import Any
 
-from arview.core.messages import sentence
+from arview.core.messages import key_of, sentence
 from arview.geometry import Array
 
 
@@ -144,6 +144,24 @@ class StepReport:
                 "done_s": done_s,
             }
             for number, (name, components, is_current, started_s, done_s) in enumerate(columns, 1)
+        ]
+
+    def since(self, zero_s: float) -> StepReport:
+        """The same with times from another zero, a time stamp."""
+        started_s, done_s = (
+            tuple(None if one is None else one - zero_s for one in times) for times in (self.started_s, self.done_s)
+        )
+        history = tuple(
+            (text, began_s - zero_s, None if ended_s is None else ended_s - zero_s)
+            for text, began_s, ended_s in self.history
+        )
+        return replace(self, started_s=started_s, done_s=done_s, history=history)
+
+    def fault_rows(self) -> list[dict[str, object]]:
+        """Each fault so far as JSON values: fault, kind, began_s, ended_s."""
+        return [
+            {"fault": text, "kind": key_of(text).removeprefix("steps."), "began_s": began_s, "ended_s": ended_s}
+            for text, began_s, ended_s in self.history
         ]
 
 

@@ -118,11 +118,14 @@ class AssemblyMonitor:
         """The turn to a pose that fits clearly better; None: no other does."""
         return self._turned.better
 
-    def turn(self, turn: Turn) -> None:
-        """Take a turned pose: what was seen of a place is known of the component that belongs there now.
+    def turn(self, turn: Turn | None = None) -> None:
+        """Take a turned pose, the better one if none is given: what was seen of a place is known of the component that
+        belongs there now.
 
         If the part was lost before, and this turn had been ruled out by then, what was known then holds again.
         """
+        turn = turn or self._turned.better
+        assert turn is not None
         before, was_resumed = self._state, self._is_resumed
         known = self._memory.before_turn(self._turned.index_of(turn)) if was_resumed else None
         self.reset()
@@ -180,8 +183,10 @@ class AssemblyMonitor:
         self.is_placed, self._is_resumed = is_placed, False
         self._report.forget()
         self._state = MonitorState.unknown(len(self._views.component_names), self._views.center_in_model)
+        self._is_awaited = np.zeros_like(self._is_base)
         if self.steps is not None:
             self.steps.restart()
+            self._is_awaited = self.steps.is_awaited
 
     def update(
         self,
@@ -206,7 +211,8 @@ class AssemblyMonitor:
         slow, fast = MOTION_PX
         sharp = float(np.clip((fast - self.observer.motion_px(before, cam_from_model)) / (fast - slow), 0.0, 1.0))
         if self.steps is not None:
-            self._follow_steps(self.steps, image, time_s, is_supported, sharp == 1.0)
+            self.steps.follow(self.observer, state, image if is_supported else None, time_s, is_sharp=sharp == 1.0)
+            self._is_awaited = self.steps.is_awaited
         # From a new direction the lines of absent components that were not seen before are missed.
         is_urgent = quality < INCOMPLETE_QUALITY and bool((state.is_suspect & ~self._is_awaited).any())
         if not self._has_components or not (is_supported or is_urgent):
@@ -220,24 +226,6 @@ class AssemblyMonitor:
         state.assume(self._is_awaited, is_there=False)
         if is_supported and state.is_suspect.any():
             self._turned.compare(cam_from_model, lambda pose: self.observer.pose_evidence(image, pose))
-
-    @property
-    def _is_awaited(self) -> NDArray[np.bool_]:
-        """(C,) components that are not mounted yet, by the steps of the assembly."""
-        return np.zeros_like(self._is_base) if self.steps is None else self.steps.is_awaited
-
-    def _follow_steps(
-        self, steps: StepMonitor, image: NDArray[np.uint8], time_s: float, is_supported: bool, is_sharp: bool
-    ) -> None:
-        """Look for components that were mounted since the last look; what was known of their places is void then."""
-        state = self._state
-        if is_supported and state.last_pose is not None and steps.is_due(time_s):
-            nothing = np.zeros_like(self._is_base)
-            known = Known(state.is_verified, steps.is_awaited, nothing, ~steps.is_watched)
-            glance = self.observer.glance(image, state.last_pose, known)
-            state.assume(steps.add(glance, time_s, is_sharp), is_there=True)
-        state.assume(steps.is_awaited, is_there=False)
-        steps.update(time_s, state.is_missing)
 
     def lines(
         self, part: PartView, cam_from_model: Array, base_part: PartView | None = None, is_base_only: bool = False

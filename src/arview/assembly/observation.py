@@ -97,7 +97,7 @@ class Observation(NamedTuple):
     shifts: Array
 
 
-class Glance(NamedTuple):
+class Glimpse(NamedTuple):
     """What one picture shows at places of components without any network; all (C,).
 
     Attributes:
@@ -205,7 +205,7 @@ class ComponentObserver:
             network = self._network_log_odds(picture, known, is_doubtful)
         return Evidence(*measured, network, places, base), picture
 
-    def glance(self, image: NDArray[np.uint8], cam_from_model: Array, known: Known) -> Glance | None:
+    def glimpse(self, image: NDArray[np.uint8], cam_from_model: Array, known: Known) -> Glimpse | None:
         """What a picture shows of components that may be mounted at any time; None where the pose may be wrong.
 
         Args:
@@ -216,7 +216,7 @@ class ComponentObserver:
         measured, _, places, base = self._measure_places(self._part_crop(image, cam_from_model), cam_from_model, known)
         if base < POSE_FOUND[1]:
             return None
-        return Glance(edge_log_odds(measured), places.bare, places.ring > MIN_OPEN)
+        return Glimpse(edge_log_odds(measured), places.bare, places.ring > MIN_OPEN)
 
     def _measure_places(
         self, crop: PartCrop, cam_from_model: Array, known: Known

@@ -13,40 +13,31 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.assembly.observation import Glance
+from arview.assembly.monitor_state import MonitorState
+from arview.assembly.observation import ComponentObserver, Glimpse, Known
 from arview.cad import Model
 from arview.core.messages import sentence
-from arview.geometry import Array
 from arview.pose import Presence, StepReport
 
-GLANCE_S = 0.1
+INTERVAL_S = 0.1
 """Time from one picture that is looked at to the next."""
 SEEN_LOG_ODDS = -3.0
 """A picture in which a component has less by its edges is evidence that it is there; by how much less is its weight."""
 MAX_SEEN = 2.0
 """Largest weight of one picture for a component."""
-SEEN = 5.0
-"""Sum from which on a component is there: three clear pictures."""
 NOT_SEEN_LOG_ODDS = 0.0
 """Components with more are not seen at their places."""
 BARE, OCCUPIED = 0.6, 0.5
 """Share of a place that looks bare, above which it is, and below which something stands there."""
+UNKNOWN = -0.2
+"""What a picture that does not show a place takes from the evidence that something stands there."""
 STEADY = 5.0
-"""Pictures of a bare place, or of one at which something else stands, after which this is sure."""
+"""Sum from which on a statement is sure: three clear pictures of a component, or five of a place."""
+MAX_SUM = 10.0
 STEADY_S = 1.0
 """Time for which something must be wrong before it is named: a component may be held in a hand, or moved."""
-
-
-class _Sums:
-    """Sums of evidence for one statement on each component, and when each sum has last begun to grow; all (C,)."""
-
-    def __init__(self, count: int) -> None:
-        self.sums, self.since_s = np.zeros(count), np.zeros(count)
-
-    def add(self, gains: Array, time_s: float, limit: float) -> None:
-        """Add the evidence of one picture."""
-        self.since_s = np.where((self.sums <= 0.0) & (gains > 0.0), time_s, self.since_s)
-        self.sums = np.clip(self.sums + gains, 0.0, limit)
+THERE, IS_BARE, OTHER = range(3)
+"""Statements on a component: it is at its place, the place is bare, something else stands there."""
 
 
 class StepMonitor:
@@ -57,7 +48,7 @@ class StepMonitor:
         base: index of the component that carries the pose: it is there from the start.
 
     Attributes:
-        report: how far the assembly is, after the last picture.
+        report: how far the assembly is, after the last frame.
     """
 
     report: StepReport
@@ -86,52 +77,79 @@ class StepMonitor:
     @property
     def presences(self) -> tuple[Presence | None, ...]:
         """Presence of each component that is awaited; None of the others."""
-        is_wrong = self._is_other(STEADY_S)
-        now = np.where(is_wrong, Presence.WRONG, Presence.NEXT)
-        found = np.where(self.is_watched, now, Presence.LATER)
+        found = np.where(self.is_watched, np.where(self._is_wrong, Presence.WRONG, Presence.NEXT), Presence.LATER)
         return tuple(Presence(one) if awaited else None for one, awaited in zip(found, self.is_awaited, strict=True))
 
     def forget(self) -> None:
         """Another specimen follows: nothing has been mounted on it yet."""
         self._seen_s = np.where(self._is_there, -np.inf, np.nan)
         self._started_s, self._done_s = np.full((2, len(self._steps)), np.nan)
-        self._history: dict[tuple[str, int], tuple[str, float]] = {}
+        self._faults: dict[tuple[str, int], tuple[str, float]] = {}
         self._ended: list[tuple[str, float, float | None]] = []
         self.restart()
         self._make_report()
 
     def restart(self) -> None:
         """Forget the evidence of pictures before the part was lost, but not what it has shown."""
-        count = len(self._names)
-        self._there, self._bare, self._other = _Sums(count), _Sums(count), _Sums(count)
-        self._shown_s, self._time_s = np.full(count, np.nan), -np.inf
+        # (3,C) sums of the evidence for each statement, and since when each has grown.
+        self._sums, self._since_s = np.zeros((2, 3, len(self._names)))
+        self._is_wrong = np.zeros(len(self._names), dtype=bool)
+        self._shown_s, self._time_s = np.full(len(self._names), np.nan), -np.inf
 
-    def is_due(self, time_s: float) -> bool:
-        """Whether a picture is to be looked at: while components are awaited, at intervals."""
-        return bool(self.is_awaited.any()) and not 0.0 <= time_s - self._time_s < GLANCE_S
-
-    def add(self, glance: Glance | None, time_s: float, is_sharp: bool = True) -> NDArray[np.bool_]:
-        """Add what a picture shows; returns (C,) the components that are known to be there by now.
+    def follow(
+        self,
+        observer: ComponentObserver,
+        state: MonitorState,
+        image: NDArray[np.uint8] | None,
+        time_s: float,
+        is_sharp: bool,
+    ) -> None:
+        """Look, at intervals, for components that were mounted; what was known of their places is void then.
 
         Args:
-            glance: what is seen; None: the pose may be wrong.
+            observer: of the components.
+            state: of the components; its last pose is that of the frame.
+            image: (H,W,3) uint8 RGB of the camera's size; None: its pose is not sure.
+            time_s: time stamp of the frame.
+            is_sharp: see `add`.
+        """
+        is_due = self.is_awaited.any() and not 0.0 <= time_s - self._time_s < INTERVAL_S
+        if image is not None and state.last_pose is not None and is_due:
+            known = Known(state.is_verified, self.is_awaited, np.zeros_like(self._is_there), ~self.is_watched)
+            state.assume(self.add(observer.glimpse(image, state.last_pose, known), time_s, is_sharp), is_there=True)
+        state.assume(self.is_awaited, is_there=False)
+        self.update(time_s, state.is_missing)
+
+    def add(self, glimpse: Glimpse | None, time_s: float, is_sharp: bool = True) -> NDArray[np.bool_]:
+        """Add what a picture shows; returns (C,) the components that are known to be there from now on.
+
+        Args:
+            glimpse: what is seen; None: the pose may be wrong.
             time_s: time stamp of the picture.
             is_sharp: edges that are not found in it are not there.
         """
         self._time_s = time_s
-        if glance is None:
+        if glimpse is None:
             return np.zeros(len(self._names), dtype=bool)
-        is_seen, is_unseen = glance.by_edges < SEEN_LOG_ODDS, glance.by_edges > NOT_SEEN_LOG_ODDS
-        gains = np.clip(SEEN_LOG_ODDS - glance.by_edges, -2.0 * MAX_SEEN, MAX_SEEN)
-        self._there.add(np.where(glance.by_edges == 0.0, 0.0, gains), time_s, SEEN)
+        is_seen, is_unseen = glimpse.by_edges < SEEN_LOG_ODDS, glimpse.by_edges > NOT_SEEN_LOG_ODDS
+        is_clear = is_unseen & glimpse.is_open & is_sharp & (glimpse.bare >= 0.0)
+        is_bare, is_other = is_clear & (glimpse.bare > BARE), is_clear & (glimpse.bare < OCCUPIED)
+        seen = np.clip(SEEN_LOG_ODDS - glimpse.by_edges, -2.0 * MAX_SEEN, MAX_SEEN)
+        gains = np.stack(
+            [
+                np.where(glimpse.by_edges == 0.0, 0.0, seen),
+                np.select([is_bare, is_other | is_seen], [1.0, -2.0], 0.0),
+                np.select([is_other, is_bare | is_seen], [1.0, -2.0], UNKNOWN),
+            ]
+        )
+        self._since_s = np.where((self._sums <= 0.0) & (gains > 0.0), time_s, self._since_s)
+        self._sums = np.clip(self._sums + gains, 0.0, MAX_SUM)
+        is_long = (self._sums[OTHER] >= STEADY) & (time_s - self._since_s[OTHER] >= STEADY_S)
+        self._is_wrong = is_long | (self._is_wrong & (self._sums[OTHER] > 0.0))
         # Of one that is partly hidden several pictures are needed, but the first that did not deny it counts.
-        begins = np.isnan(self._shown_s) & (glance.by_edges < NOT_SEEN_LOG_ODDS)
+        begins = np.isnan(self._shown_s) & (glimpse.by_edges < NOT_SEEN_LOG_ODDS)
         self._shown_s = np.where(is_unseen, np.nan, np.where(begins, time_s, self._shown_s))
-        is_clear = is_unseen & glance.is_open & is_sharp & (glance.bare >= 0.0)
-        is_bare, is_other = is_clear & (glance.bare > BARE), is_clear & (glance.bare < OCCUPIED)
-        self._bare.add(np.select([is_bare, is_other | is_seen], [1.0, -2.0], 0.0), time_s, STEADY)
-        self._other.add(np.select([is_other, is_bare | is_seen], [1.0, -2.0], -0.2), time_s, STEADY)
-        is_new = self.is_awaited & (self._there.sums >= SEEN)
+        is_new = self.is_awaited & (self._sums[THERE] >= STEADY)
         self._seen_s = np.where(is_new, self._shown_s, self._seen_s)
         return np.asarray(is_new)
 
@@ -142,40 +160,35 @@ class StepMonitor:
             time_s: time stamp of the frame.
             is_gone: (C,) components that were seen not to be at their places any longer.
         """
-        for k in range(len(self._steps)):
+        for k in np.flatnonzero(np.isnan(self._done_s)):
             before_s = self._done_s[self._before[k]]
             if not np.isnan(before_s).any():
-                if np.isnan(self._started_s[k]):
-                    self._started_s[k] = np.max(before_s) if len(before_s) else time_s
-                seen_s = float(np.max(self._seen_s[self._mounts[k]]))
-                if np.isnan(self._done_s[k]) and not np.isnan(seen_s):
-                    self._done_s[k] = time_s if np.isinf(seen_s) else seen_s
-                    self._started_s[k] = min(self._started_s[k], self._done_s[k])
-        faults = {(key, c): (text, began_s) for key, c, text, began_s in self._faults(time_s, is_gone)}
-        for fault in self._history.keys() - faults.keys():
-            self._ended.append((*self._history.pop(fault), time_s))
-        self._history = faults | self._history
+                start_s = np.max(before_s) if len(before_s) else np.fmin(self._started_s[k], time_s)
+                seen_s = np.max(self._seen_s[self._mounts[k]])
+                self._done_s[k] = time_s if np.isinf(seen_s) else seen_s
+                self._started_s[k] = np.fmin(start_s, self._done_s[k])
+        now = {(kind, c): (text, began_s) for kind, c, text, began_s in self._faults_now(time_s, is_gone)}
+        self._ended += [(*self._faults[fault], time_s) for fault in self._faults.keys() - now.keys()]
+        self._faults = {fault: self._faults.get(fault, said) for fault, said in now.items()}
         self._make_report()
 
-    def _faults(self, time_s: float, is_gone: NDArray[np.bool_]) -> Iterator[tuple[str, int, str, float]]:
+    def _faults_now(self, time_s: float, is_gone: NDArray[np.bool_]) -> Iterator[tuple[str, int, str, float]]:
         """What is wrong in a frame: its kind and component, a sentence, and since when."""
-        is_done, is_other = ~np.isnan(self._done_s), self._is_other(STEADY_S)
-        for k in np.flatnonzero(~is_done):
-            lacking = self._mounts[self._before[k] & ~is_done].any(axis=0) & self.is_awaited
-            lacking &= (self._bare.sums >= STEADY) | is_other
-            for c in np.flatnonzero(self._mounts[k] & (time_s - self._seen_s >= STEADY_S) & np.isfinite(self._seen_s)):
-                if lacking.any():
+        is_open = np.isnan(self._done_s)
+        is_sure = (self._sums[IS_BARE] >= STEADY) | self._is_wrong
+        is_early = (time_s - self._seen_s >= STEADY_S) & np.isfinite(self._seen_s)
+        for k in np.flatnonzero(is_open):
+            lacking = self._mounts[self._before[k] & is_open].any(axis=0) & self.is_awaited
+            for c in np.flatnonzero(self._mounts[k] & is_early).tolist():
+                # What was named stays named until it is put right, whatever hides the place meanwhile.
+                if (lacking & (is_sure | (("order", c) in self._faults))).any():
                     others = ", ".join(self._names[other] for other in np.flatnonzero(lacking))
                     text = sentence("steps.wrong_order", name=self._names[c], others=others)
-                    yield "order", int(c), text, float(self._seen_s[c])
-        for c in np.flatnonzero(self.is_watched & is_other):
-            yield "part", int(c), sentence("steps.wrong_part", name=self._names[c]), float(self._other.since_s[c])
-        for c in np.flatnonzero(is_gone & np.isfinite(self._seen_s)):
-            yield "gone", int(c), sentence("steps.missing", name=self._names[c]), time_s
-
-    def _is_other(self, steady_s: float) -> NDArray[np.bool_]:
-        """(C,) components at whose places something else has stood for a time."""
-        return np.asarray((self._other.sums >= STEADY) & (self._time_s - self._other.since_s >= steady_s))
+                    yield "order", c, text, float(self._seen_s[c])
+        for c in np.flatnonzero(self.is_watched & self._is_wrong).tolist():
+            yield "part", c, sentence("steps.wrong_part", name=self._names[c]), float(self._since_s[OTHER, c])
+        for c in np.flatnonzero(is_gone & np.isfinite(self._seen_s)).tolist():
+            yield "gone", c, sentence("steps.missing", name=self._names[c]), time_s
 
     def _is_current(self) -> NDArray[np.bool_]:
         """(S,) steps that are to be done now."""
@@ -192,6 +205,6 @@ class StepMonitor:
             is_current=tuple(self._is_current().tolist()),
             started_s=started_s,
             done_s=done_s,
-            faults=tuple(text for text, _ in self._history.values()),
-            history=(*self._ended, *((text, began_s, None) for text, began_s in self._history.values())),
+            faults=tuple(text for text, _ in self._faults.values()),
+            history=(*self._ended, *((text, began_s, None) for text, began_s in self._faults.values())),
         )

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-from arview.cad.model import Model, Step
+from arview.cad.model import Model
 from arview.cad.shape.symmetry import Symmetry
 from arview.cad.view_range import Up, ViewRange
 from arview.errors import InputError
@@ -244,11 +244,6 @@ class Part:
     def inspected(self) -> tuple[str, ...]:
         """Names of the components that are measured and judged."""
         return tuple(settings.name for settings in self.settings if settings.role == "inspect")
-
-    @property
-    def steps(self) -> tuple[Step, ...]:
-        """The steps of the assembly, which the model has; empty if none are declared."""
-        return self.model.steps
 
     @property
     def effective_view_range(self) -> ViewRange:

@@ -15,7 +15,7 @@ import time
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.assembly import AssemblyMonitor, Turn
+from arview.assembly import AssemblyMonitor
 from arview.cad import Model
 from arview.camera import Camera, FrameView
 from arview.core.checks import check_type
@@ -353,7 +353,7 @@ class SpecimenTracking:
         return estimate
 
     def _restart(
-        self, image: NDArray[np.uint8], cam_from_model: Array, turn: Turn | None = None, rests_on_base: bool = False
+        self, image: NDArray[np.uint8], cam_from_model: Array, is_turned: bool = False, rests_on_base: bool = False
     ) -> Estimate:
         """Track from a pose on; nothing is known of the components yet, unless it is the pose so far, turned.
 
@@ -363,10 +363,10 @@ class SpecimenTracking:
             lines = self.components.lines(self._part, cam_from_model, self.search.base_part, is_base_only=True)
             self.tracker.expect(lines)
         self.tracker.start(image, cam_from_model)
-        if turn is None:
-            self.components.reset(is_placed=not rests_on_base)
+        if is_turned:
+            self.components.turn()
         else:
-            self.components.turn(turn)
+            self.components.reset(is_placed=not rests_on_base)
         return self.tracker.track(image)
 
     # --- Examine a pose -----------------------------------------------------------------------------------
@@ -379,7 +379,7 @@ class SpecimenTracking:
         if self.components.rests_on_base:
             estimate = self._recheck_whole(image, estimate)
         if (turn := self.components.better_turn) is not None:
-            return self._restart(image, estimate.cam_from_model @ turn.model_from_model, turn), reason
+            return self._restart(image, estimate.cam_from_model @ turn.model_from_model, is_turned=True), reason
         pose = estimate.cam_from_model
         if self._turns.is_due():
             colors, covariance = self.tracker.state.appearance.colors, self.tracker.covariance(estimate)

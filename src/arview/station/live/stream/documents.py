@@ -54,12 +54,19 @@ def _part_pose_document(pose: Pose, subject: Subject | None) -> Document:
         "mismatches": list(pose.mismatches),
         "unverified": list(pose.unverified),
         **evidence_document(pose, subject),
+        "steps": _steps_document(pose),
         "identity": str(pose.identity),
         "serial": pose.serial,
         "ambiguous": len(pose.alternatives),
         "cam_from_model": None if pose.cam_from_model is None else pose.cam_from_model.ravel().tolist(),
         "guide_cam_from_model": None if guide is None else guide.ravel().tolist(),
     }
+
+
+def _steps_document(pose: Pose) -> Document | None:
+    """What is to be done now in the assembly of a part, what is wrong, and all its steps; None of one without steps."""
+    steps = pose.steps
+    return None if steps is None else {"text": steps.text, "faults": list(steps.faults), "rows": steps.rows()}
 
 
 def evidence_document(pose: Pose, subject: Subject | None) -> Document:
