@@ -21,7 +21,7 @@ from arview.pose import Presence, StepReport
 
 INTERVAL_S = 0.1
 """Time from one picture that is looked at to the next."""
-SEEN_LOG_ODDS = -3.0
+SEEN_LOG_ODDS = -2.5
 """A picture in which a component has less by its edges is evidence that it is there; by how much less is its weight."""
 MAX_SEEN = 2.0
 """Largest weight of one picture for a component."""
@@ -36,6 +36,8 @@ STEADY = 5.0
 MAX_SUM = 10.0
 STEADY_S = 1.0
 """Time for which something must be wrong before it is named: a component may be held in a hand, or moved."""
+EARLY_S = 0.4
+"""A place that is seen bare so long after a component of a later step came to its own shows that the order is wrong."""
 THERE, IS_BARE, OTHER = range(3)
 """Statements on a component: it is at its place, the place is bare, something else stands there."""
 
@@ -94,7 +96,9 @@ class StepMonitor:
         # (3,C) sums of the evidence for each statement, and since when each has grown.
         self._sums, self._since_s = np.zeros((2, 3, len(self._names)))
         self._is_wrong = np.zeros(len(self._names), dtype=bool)
-        self._shown_s, self._time_s = np.full(len(self._names), np.nan), -np.inf
+        # (C,) since when each is not denied, and when its place was last seen bare.
+        self._shown_s, self._bare_s = np.full((2, len(self._names)), np.nan)
+        self._time_s = -np.inf
 
     def follow(
         self,
@@ -131,17 +135,19 @@ class StepMonitor:
         self._time_s = time_s
         if glimpse is None:
             return np.zeros(len(self._names), dtype=bool)
-        is_seen, is_unseen = glimpse.by_edges < SEEN_LOG_ODDS, glimpse.by_edges > NOT_SEEN_LOG_ODDS
-        is_clear = is_unseen & glimpse.is_open & is_sharp & (glimpse.bare >= 0.0)
+        is_covered = (glimpse.bare >= 0.0) & ~glimpse.is_open
+        is_seen, is_unseen = glimpse.by_edges < SEEN_LOG_ODDS, (glimpse.by_edges > NOT_SEEN_LOG_ODDS) & ~is_covered
+        is_clear = is_unseen & is_sharp & (glimpse.bare >= 0.0)
         is_bare, is_other = is_clear & (glimpse.bare > BARE), is_clear & (glimpse.bare < OCCUPIED)
         seen = np.clip(SEEN_LOG_ODDS - glimpse.by_edges, -2.0 * MAX_SEEN, MAX_SEEN)
         gains = np.stack(
             [
-                np.where(glimpse.by_edges == 0.0, 0.0, seen),
+                np.where((glimpse.by_edges == 0.0) | (is_covered & ~is_seen), 0.0, seen),
                 np.select([is_bare, is_other | is_seen], [1.0, -2.0], 0.0),
                 np.select([is_other, is_bare | is_seen], [1.0, -2.0], UNKNOWN),
             ]
         )
+        self._bare_s = np.where(is_bare, time_s, self._bare_s)
         self._since_s = np.where((self._sums <= 0.0) & (gains > 0.0), time_s, self._since_s)
         self._sums = np.clip(self._sums + gains, 0.0, MAX_SUM)
         is_long = (self._sums[OTHER] >= STEADY) & (time_s - self._since_s[OTHER] >= STEADY_S)
@@ -175,13 +181,13 @@ class StepMonitor:
     def _faults_now(self, time_s: float, is_gone: NDArray[np.bool_]) -> Iterator[tuple[str, int, str, float]]:
         """What is wrong in a frame: its kind and component, a sentence, and since when."""
         is_open = np.isnan(self._done_s)
-        is_sure = (self._sums[IS_BARE] >= STEADY) | self._is_wrong
-        is_early = (time_s - self._seen_s >= STEADY_S) & np.isfinite(self._seen_s)
+        bare_s = np.where(self._sums[IS_BARE] >= STEADY, self._bare_s, np.where(self._is_wrong, time_s, np.nan))
         for k in np.flatnonzero(is_open):
             lacking = self._mounts[self._before[k] & is_open].any(axis=0) & self.is_awaited
-            for c in np.flatnonzero(self._mounts[k] & is_early).tolist():
+            for c in np.flatnonzero(self._mounts[k] & np.isfinite(self._seen_s)).tolist():
                 # What was named stays named until it is put right, whatever hides the place meanwhile.
-                if (lacking & (is_sure | (("order", c) in self._faults))).any():
+                is_early = (bare_s >= self._seen_s[c] + EARLY_S) | (("order", c) in self._faults)
+                if (lacking & is_early).any():
                     others = ", ".join(self._names[other] for other in np.flatnonzero(lacking))
                     text = sentence("steps.wrong_order", name=self._names[c], others=others)
                     yield "order", c, text, float(self._seen_s[c])
