@@ -45,6 +45,11 @@ SUSPECT_LOG_ODDS = 1.0
 """Components with more are suspects."""
 MIN_OPEN = 0.75
 """Share of the pixels beside a place that must look as they should for the place to be open."""
+MAX_EXTENT = (0.35, 0.65)
+"""How far beside an open place what stands there may go on, see `BarePlaces`; the second where the edges around are
+found. A hand or a tool goes on to the border of the picture."""
+MIN_AROUND = 0.45
+"""Share of the edges around a place from which on they are found."""
 POSE_FOUND = (0.4, 0.55)
 """Share of the edge points of the base, and of others that are there, up to which the pose counts as wrong, and from
 which on it counts as right."""
@@ -216,7 +221,8 @@ class ComponentObserver:
         measured, _, places, base = self._measure_places(self._part_crop(image, cam_from_model), cam_from_model, known)
         if base < POSE_FOUND[1]:
             return None
-        return Glimpse(edge_log_odds(measured), places.bare, places.ring > MIN_OPEN)
+        is_open = (places.ring > MIN_OPEN) & (places.extent < np.where(places.around > MIN_AROUND, *MAX_EXTENT[::-1]))
+        return Glimpse(edge_log_odds(measured), places.bare, is_open)
 
     def _measure_places(
         self, crop: PartCrop, cam_from_model: Array, known: Known
