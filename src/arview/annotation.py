@@ -293,8 +293,13 @@ class _SpecimenCounts:
         last = self._last
         presence = {} if last is None else {name: one.presence for name, one in last.components.items()}
         completeness = None if last is None else last.completeness
-        steps = () if last is None or last.steps is None else (last.steps.text, *(one[0] for one in last.steps.history))
-        return SpecimenSummary(dict(self._states), completeness, presence, self._serial, steps)
+        return SpecimenSummary(
+            dict(self._states),
+            completeness,
+            presence,
+            self._serial,
+            () if last is None or last.steps is None else (last.steps.text, *(one[0] for one in last.steps.history)),
+        )
 
 
 class _OutputFiles:

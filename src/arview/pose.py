@@ -123,18 +123,19 @@ class StepReport:
     @property
     def text(self) -> str:
         """What is to be done now, in one sentence, such as ``3/12 mount post_3``."""
-        count = len(self.names)
-        if False not in (is_done := [done_s is not None for done_s in self.done_s]):
+        count, waiting = len(self.names), [k for k, done_s in enumerate(self.done_s) if done_s is None]
+        if not waiting:
             return sentence("steps.done", count=count)
-        current = self.is_current.index(True) if True in self.is_current else is_done.index(False)
-        listed = ", ".join(self.components[current])
-        key = "steps.mount" if self.names[current] == listed else "steps.named"
-        return sentence(key, number=current + 1, count=count, names=listed, name=self.names[current])
+        name, listed = self.names[waiting[0]], ", ".join(self.components[waiting[0]])
+        key = "steps.mount" if name == listed else "steps.named"
+        return sentence(key, number=waiting[0] + 1, count=count, names=listed, name=name)
 
     def rows(self) -> list[dict[str, object]]:
-        """Each step as JSON values: number, name, components, state, started_s, done_s."""
+        """Each step as JSON values: step, name, components, state, started_s, done_s; then each fault so far: fault,
+        kind, began_s, ended_s.
+        """
         columns = zip(self.names, self.components, self.is_current, self.started_s, self.done_s, strict=True)
-        return [
+        steps: list[dict[str, object]] = [
             {
                 "step": number,
                 "name": name,
@@ -145,6 +146,11 @@ class StepReport:
             }
             for number, (name, components, is_current, started_s, done_s) in enumerate(columns, 1)
         ]
+        faults: list[dict[str, object]] = [
+            {"fault": text, "kind": key_of(text).removeprefix("steps."), "began_s": began_s, "ended_s": ended_s}
+            for text, began_s, ended_s in self.history
+        ]
+        return steps + faults
 
     def since(self, zero_s: float) -> StepReport:
         """The same with times from another zero, a time stamp."""
@@ -156,13 +162,6 @@ class StepReport:
             for text, began_s, ended_s in self.history
         )
         return replace(self, started_s=started_s, done_s=done_s, history=history)
-
-    def fault_rows(self) -> list[dict[str, object]]:
-        """Each fault so far as JSON values: fault, kind, began_s, ended_s."""
-        return [
-            {"fault": text, "kind": key_of(text).removeprefix("steps."), "began_s": began_s, "ended_s": ended_s}
-            for text, began_s, ended_s in self.history
-        ]
 
 
 MAX_NAMES = 3

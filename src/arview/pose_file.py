@@ -96,27 +96,30 @@ class _StepRecord:
 
     def add(self, pose: Pose, image: NDArray[np.uint8] | None) -> None:
         """Add a frame."""
-        if pose.steps is None:
-            return
-        self._reports[pose.instance] = pose.steps
-        for number, done_s in enumerate(pose.steps.done_s, 1):
+        if pose.steps is not None:
+            self._reports[pose.instance] = pose.steps
+        for number, done_s in enumerate(() if pose.steps is None or image is None else pose.steps.done_s, 1):
             if done_s is not None and image is not None and (pose.instance, number) not in self._photos:
-                jpeg = cv2.imencode(".jpg", image[..., ::-1])[1].tobytes()
-                self._photos[pose.instance, number] = jpeg
+                self._photos[pose.instance, number] = cv2.imencode(".jpg", image[..., ::-1])[1].tobytes()
 
     def save(self, poses_path: Path) -> None:
         """Write the file and the photos beside the file of the poses, the photos first."""
         names = {key: f"{number:02}.jpg" for number, key in enumerate(self._photos, 1)}
         for key, jpeg in self._photos.items():
             write_file(poses_path.with_suffix(".steps") / names[key], jpeg, makes_folder=True)
-        lines = []
-        for instance, report in self._reports.items():
-            told = {"instance": instance} if instance else {}
-            lines += [{**row, "photo": names.get((instance, k), ""), **told} for k, row in enumerate(report.rows(), 1)]
-            lines += [{**fault, **told} for fault in report.fault_rows()]
+        lines = [
+            json.dumps(
+                {
+                    **row,
+                    **({"photo": names.get((instance, number), "")} if "step" in row else {}),
+                    **({"instance": instance} if instance else {}),
+                }
+            )
+            for instance, report in self._reports.items()
+            for number, row in enumerate(report.rows(), 1)
+        ]
         if lines:
-            text = "".join(f"{json.dumps(line)}\n" for line in lines)
-            write_file(poses_path.with_suffix(".steps.jsonl"), text.encode())
+            write_file(poses_path.with_suffix(".steps.jsonl"), "".join(f"{line}\n" for line in lines).encode())
 
 
 def pose_line(pose: Pose, camera: Camera | None = None, file: str = "") -> str:

@@ -241,10 +241,9 @@ class BarePlaceMeter:
             return -1.0, -1.0, -1.0
         # Single pixels of another colour are noise; a hand or a tool is connected with the place, and goes on.
         joined = cv2.connectedComponents(cv2.morphologyEx(strange, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)))[1]
-        is_joined = np.isin(joined, joined[(distance == 0.0) & (joined > 0)])
-        extent = float(np.max(distance[is_joined], initial=0.0)) / reach
+        goes_on = distance[np.isin(joined, joined[(distance == 0.0) & (joined > 0)])]
         # What differs in its texture alone has no border.
-        extent = 1.0 if like > 0.5 * weight > bare else extent
+        extent = 1.0 if like > 0.5 * weight > bare else float(np.max(goes_on, initial=0.0)) / reach
         return bare / weight, ring / ringed if ringed > 0 else -1.0, extent
 
     def _texture_match(self, pixels: NDArray[np.float32], colours: _Colours) -> float:

@@ -43,13 +43,12 @@ TRUSTED_LOG_ODDS = -2.0
 behind absent ones."""
 SUSPECT_LOG_ODDS = 1.0
 """Components with more are suspects."""
-MIN_OPEN = 0.75
-"""Share of the pixels beside a place that must look as they should for the place to be open."""
-MAX_EXTENT = (0.35, 0.65)
-"""How far beside an open place what stands there may go on, see `BarePlaces`; the second where the edges around are
-found. A hand or a tool goes on to the border of the picture."""
-MIN_AROUND = 0.45
-"""Share of the edges around a place from which on they are found."""
+MIN_OPEN, MIN_AROUND = 0.75, 0.45
+"""A place is open where more of the pixels beside it look as they should; share of the edges around it from which on
+these are found."""
+MAX_EXTENT = (0.65, 0.35)
+"""How far beside an open place what stands there may go on, see `BarePlaces`, if the edges around are found, and if they
+are not: a hand or a tool goes on to the border of the picture."""
 POSE_FOUND = (0.4, 0.55)
 """Share of the edge points of the base, and of others that are there, up to which the pose counts as wrong, and from
 which on it counts as right."""
@@ -221,7 +220,7 @@ class ComponentObserver:
         measured, _, places, base = self._measure_places(self._part_crop(image, cam_from_model), cam_from_model, known)
         if base < POSE_FOUND[1]:
             return None
-        is_open = (places.ring > MIN_OPEN) & (places.extent < np.where(places.around > MIN_AROUND, *MAX_EXTENT[::-1]))
+        is_open = (places.ring > MIN_OPEN) & (places.extent < np.where(places.around > MIN_AROUND, *MAX_EXTENT))
         return Glimpse(edge_log_odds(measured), places.bare, is_open)
 
     def _measure_places(

@@ -21,23 +21,20 @@ from arview.pose import Presence, StepReport
 
 INTERVAL_S = 0.1
 """Time from one picture that is looked at to the next."""
-SEEN_LOG_ODDS = -2.5
-"""A picture in which a component has less by its edges is evidence that it is there; by how much less is its weight."""
+SEEN_LOG_ODDS, UNSEEN_LOG_ODDS = -2.5, 0.0
+"""A component with less by its edges is seen at its place, and by how much less is the weight of the picture; one with
+more is not seen."""
 MAX_SEEN = 2.0
 """Largest weight of one picture for a component."""
-NOT_SEEN_LOG_ODDS = 0.0
-"""Components with more are not seen at their places."""
 BARE, OCCUPIED = 0.6, 0.5
 """Share of a place that looks bare, above which it is, and below which something stands there."""
 UNKNOWN = -0.2
 """What a picture that does not show a place takes from the evidence that something stands there."""
-STEADY = 5.0
-"""Sum from which on a statement is sure: three clear pictures of a component, or five of a place."""
-MAX_SUM = 10.0
-STEADY_S = 1.0
-"""Time for which something must be wrong before it is named: a component may be held in a hand, or moved."""
-EARLY_S = 0.4
-"""A place that is seen bare so long after a component of a later step came to its own shows that the order is wrong."""
+STEADY, MAX_SUM = 5.0, 10.0
+"""Sum from which on a statement is sure, three clear pictures of a component or five of a place; and its bound."""
+STEADY_S, EARLY_S = 1.0, 0.4
+"""Time for which something else must stand at a place before it is named: a component may be held in a hand. Time after
+which a place that is seen bare shows that a component of a later step was mounted too early."""
 THERE, IS_BARE, OTHER = range(3)
 """Statements on a component: it is at its place, the place is bare, something else stands there."""
 
@@ -52,8 +49,6 @@ class StepMonitor:
     Attributes:
         report: how far the assembly is, after the last frame.
     """
-
-    report: StepReport
 
     def __init__(self, model: Model, base: int) -> None:
         self._steps, self._names = model.steps, tuple(component.name for component in model.components)
@@ -136,28 +131,31 @@ class StepMonitor:
         if glimpse is None:
             return np.zeros(len(self._names), dtype=bool)
         is_covered = (glimpse.bare >= 0.0) & ~glimpse.is_open
-        is_seen, is_unseen = glimpse.by_edges < SEEN_LOG_ODDS, (glimpse.by_edges > NOT_SEEN_LOG_ODDS) & ~is_covered
+        is_seen, is_unseen = glimpse.by_edges < SEEN_LOG_ODDS, (glimpse.by_edges > UNSEEN_LOG_ODDS) & ~is_covered
         is_clear = is_unseen & is_sharp & (glimpse.bare >= 0.0)
         is_bare, is_other = is_clear & (glimpse.bare > BARE), is_clear & (glimpse.bare < OCCUPIED)
-        seen = np.clip(SEEN_LOG_ODDS - glimpse.by_edges, -2.0 * MAX_SEEN, MAX_SEEN)
         gains = np.stack(
             [
-                np.where((glimpse.by_edges == 0.0) | (is_covered & ~is_seen), 0.0, seen),
+                np.where(
+                    (glimpse.by_edges == 0.0) | (is_covered & ~is_seen),
+                    0.0,
+                    np.clip(SEEN_LOG_ODDS - glimpse.by_edges, -2.0 * MAX_SEEN, MAX_SEEN),
+                ),
                 np.select([is_bare, is_other | is_seen], [1.0, -2.0], 0.0),
                 np.select([is_other, is_bare | is_seen], [1.0, -2.0], UNKNOWN),
             ]
         )
-        self._bare_s = np.where(is_bare, time_s, self._bare_s)
+        self._bare_s[is_bare] = time_s
         self._since_s = np.where((self._sums <= 0.0) & (gains > 0.0), time_s, self._since_s)
         self._sums = np.clip(self._sums + gains, 0.0, MAX_SUM)
-        is_long = (self._sums[OTHER] >= STEADY) & (time_s - self._since_s[OTHER] >= STEADY_S)
-        self._is_wrong = is_long | (self._is_wrong & (self._sums[OTHER] > 0.0))
+        self._is_wrong &= self._sums[OTHER] > 0.0
+        self._is_wrong |= (self._sums[OTHER] >= STEADY) & (time_s - self._since_s[OTHER] >= STEADY_S)
         # Of one that is partly hidden several pictures are needed, but the first that did not deny it counts.
-        begins = np.isnan(self._shown_s) & (glimpse.by_edges < NOT_SEEN_LOG_ODDS)
-        self._shown_s = np.where(is_unseen, np.nan, np.where(begins, time_s, self._shown_s))
-        is_new = self.is_awaited & (self._sums[THERE] >= STEADY)
-        self._seen_s = np.where(is_new, self._shown_s, self._seen_s)
-        return np.asarray(is_new)
+        self._shown_s[np.isnan(self._shown_s) & (glimpse.by_edges < UNSEEN_LOG_ODDS)] = time_s
+        self._shown_s[is_unseen] = np.nan
+        is_new = np.asarray(self.is_awaited & (self._sums[THERE] >= STEADY))
+        self._seen_s[is_new] = self._shown_s[is_new]
+        return is_new
 
     def update(self, time_s: float, is_gone: NDArray[np.bool_]) -> None:
         """Take what is known into account; to be called for each frame.
@@ -188,8 +186,8 @@ class StepMonitor:
                 # What was named stays named until it is put right, whatever hides the place meanwhile.
                 is_early = (bare_s >= self._seen_s[c] + EARLY_S) | (("order", c) in self._faults)
                 if (lacking & is_early).any():
-                    others = ", ".join(self._names[other] for other in np.flatnonzero(lacking))
-                    text = sentence("steps.wrong_order", name=self._names[c], others=others)
+                    names = (self._names[other] for other in np.flatnonzero(lacking))
+                    text = sentence("steps.wrong_order", name=self._names[c], others=", ".join(names))
                     yield "order", c, text, float(self._seen_s[c])
         for c in np.flatnonzero(self.is_watched & self._is_wrong).tolist():
             yield "part", c, sentence("steps.wrong_part", name=self._names[c]), float(self._since_s[OTHER, c])

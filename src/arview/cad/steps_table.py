@@ -34,8 +34,9 @@ def read_steps(tables: Sequence[TomlTable], components: Sequence[str]) -> tuple[
         name = table.line("name", ", ".join(mount))
         if name in earlier:
             table.fail("name", name, "a name that no other step has")
-        is_free = table.known("after") and table.content["after"] == []
-        after = () if is_free else table.texts("after", tuple(earlier[-1:]))
+        after = (
+            () if table.known("after") and table.content["after"] == [] else table.texts("after", tuple(earlier[-1:]))
+        )
         for other in after:
             if other not in earlier:
                 table.fail("after", other, f"names of steps above this one, of {', '.join(earlier) or 'none'}")

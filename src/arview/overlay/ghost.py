@@ -58,7 +58,6 @@ class Ghost:
         """Prepare a model, given the topology of each of its components."""
         self.camera = camera
         self._vertices_in_model, self._faces, self._component_of_face = model.mesh
-        self._is_left_out = np.zeros(len(model.components), dtype=bool)
         # Of a closed mesh only faces towards the camera are visible: 1, or -1 if it is wound inside out.
         winding = [(-1 if shape.is_inside_out else 1) if shape.is_closed else 0 for shape in shapes]
         self._winding = np.array(winding, dtype=np.int8)[self._component_of_face]
@@ -88,10 +87,9 @@ class Ghost:
 
     def leave_out(self, is_left_out: NDArray[np.bool_]) -> None:
         """Leave some components (C,) out of the views that follow: they hide nothing, either."""
-        if not np.array_equal(is_left_out, self._is_left_out):
-            self._is_left_out, kept = is_left_out, ~is_left_out[self._all_faces[2]]
-            faces, winding, component_of_face = self._all_faces
-            self._faces, self._winding, self._component_of_face = faces[kept], winding[kept], component_of_face[kept]
+        faces, winding, component_of_face = self._all_faces
+        kept = ~is_left_out[component_of_face]
+        self._faces, self._winding, self._component_of_face = faces[kept], winding[kept], component_of_face[kept]
 
     def view(self, cam_from_model: Array) -> GhostView | None:
         """Render the model at a pose (4,4); None if the part is outside the image."""

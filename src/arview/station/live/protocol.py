@@ -158,7 +158,8 @@ Pose::
      "withheld": {"title", "text"} | null,     of another specimen: nothing that was measured is shown
      "steps": {"text": what is to be done now, "faults": [texts], "rows": [{"step": number from 1, "name",
                "components": [names], "state": "done" | "current" | "locked", "started_s", "done_s": time
-               stamp of a frame | null}]} | null,     of a part with [[steps]]
+               stamp of a frame | null}, …, {"fault": text, "kind", "began_s", "ended_s"}, …]}
+               | null,     of a part with [[steps]]
      "identity": "followed" | "confirmed" | "unconfirmed" | "other",   is it the part that was followed, see Identity
      "serial": read from a code on the part, or empty,
      "legend": [{"kind": evidence, "text"}],   kinds of evidence that need an explanation

@@ -45,7 +45,7 @@ def _list_of_several(parts: list[Document]) -> Document:
 
 def _part_pose_document(pose: Pose, subject: Subject | None) -> Document:
     """What *Pose* says of one part."""
-    guide = pose.guide_cam_from_model
+    guide, steps = pose.guide_cam_from_model, pose.steps
     return {
         "state": str(pose.state),
         "quality": round(pose.quality, 3),
@@ -54,19 +54,13 @@ def _part_pose_document(pose: Pose, subject: Subject | None) -> Document:
         "mismatches": list(pose.mismatches),
         "unverified": list(pose.unverified),
         **evidence_document(pose, subject),
-        "steps": _steps_document(pose),
+        "steps": steps and {"text": steps.text, "faults": list(steps.faults), "rows": steps.rows()},
         "identity": str(pose.identity),
         "serial": pose.serial,
         "ambiguous": len(pose.alternatives),
         "cam_from_model": None if pose.cam_from_model is None else pose.cam_from_model.ravel().tolist(),
         "guide_cam_from_model": None if guide is None else guide.ravel().tolist(),
     }
-
-
-def _steps_document(pose: Pose) -> Document | None:
-    """What is to be done now in the assembly of a part, what is wrong, and all its steps; None of one without steps."""
-    steps = pose.steps
-    return None if steps is None else {"text": steps.text, "faults": list(steps.faults), "rows": steps.rows()}
 
 
 def evidence_document(pose: Pose, subject: Subject | None) -> Document:
