@@ -186,9 +186,9 @@ class StepMonitor:
                 # What was named stays named until it is put right, whatever hides the place meanwhile.
                 is_early = (bare_s >= self._seen_s[c] + EARLY_S) | (("order", c) in self._faults)
                 if (lacking & is_early).any():
-                    names = (self._names[other] for other in np.flatnonzero(lacking))
-                    text = sentence("steps.wrong_order", name=self._names[c], others=", ".join(names))
-                    yield "order", c, text, float(self._seen_s[c])
+                    others = ", ".join(self._names[other] for other in np.flatnonzero(lacking))
+                    said = sentence("steps.wrong_order", name=self._names[c], others=others)
+                    yield "order", c, said, float(self._seen_s[c])
         for c in np.flatnonzero(self.is_watched & self._is_wrong).tolist():
             yield "part", c, sentence("steps.wrong_part", name=self._names[c]), float(self._since_s[OTHER, c])
         for c in np.flatnonzero(is_gone & np.isfinite(self._seen_s)).tolist():
