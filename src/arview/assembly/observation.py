@@ -47,8 +47,8 @@ MIN_OPEN, MIN_AROUND = 0.75, 0.45
 """A place is open where more of the pixels beside it look as they should; share of the edges around it from which on
 these are found."""
 MAX_EXTENT = (0.65, 0.35)
-"""How far beside an open place what stands there may go on, see `BarePlaces`, if the edges around are found, and if not:
-a hand or a tool goes on to the border of the picture."""
+"""How far beside an open place what stands there may go on, see `BarePlaces`, if the edges around are found, and if
+not: a hand or a tool goes on to the border of the picture."""
 POSE_FOUND = (0.4, 0.55)
 """Share of the edge points of the base, and of others that are there, up to which the pose counts as wrong, and from
 which on it counts as right."""
