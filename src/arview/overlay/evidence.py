@@ -36,8 +36,6 @@ _DIMMED_OPACITY = 0.45
 """Factor of the opacity of components that the pictures do not verify."""
 _DIMMED_SHARE = 0.6
 """Share of grey in the colour of a dimmed verdict."""
-_NEXT_OPACITY = 0.6
-"""Opacity of the ghost of a component that is to be mounted now; nothing real is behind it but its bare place."""
 _HATCH_OPACITY = 0.75
 """Opacity of the lines of a hatched ghost: higher than of a plain one, because they cover little."""
 
@@ -76,6 +74,8 @@ class DrawnEvidence(StrEnum):
         return self in (DrawnEvidence.NEXT, DrawnEvidence.LATER)
 
 
+_AWAITED = {DrawnEvidence.NEXT: (0.6, 1.0, 1.0), DrawnEvidence.LATER: (0.0, 0.0, 0.0)}
+"""Opacity of ghost and edges, and weight, of components to be mounted; behind the next one is its bare place."""
 _EVIDENCE = {
     Presence.UNVERIFIED: DrawnEvidence.UNVERIFIED,
     Presence.UNCERTAIN: DrawnEvidence.UNCERTAIN,
@@ -149,9 +149,7 @@ def component_styles(
         if seen is DrawnEvidence.WITHHELD:
             color, opacity, edge_alpha = CONTEXT_RGB, 0.0, 1.0
         elif seen.is_awaited:
-            color, opacity, edge_alpha, cost = NEXT_RGB, _NEXT_OPACITY, 1.0, 1.0
-            if seen is DrawnEvidence.LATER:
-                opacity = edge_alpha = cost = 0.0
+            color, (opacity, edge_alpha, cost) = NEXT_RGB, _AWAITED[seen]
         elif seen.is_refuted:
             color, opacity = DISPLACED_RGB if seen is DrawnEvidence.DISPLACED else MISSING_RGB, _HATCH_OPACITY
             pattern = CROSSES if seen is DrawnEvidence.MISSING else STRIPES
