@@ -81,12 +81,14 @@ class SpecimenSummary:
         completeness: by the last frame with a pose; None if there is none.
         presence: of each component by that frame.
         serial: read from a code on the specimen, or empty.
+        steps: how far its assembly is, and what was wrong, in sentences.
     """
 
     states: Mapping[str, int]
     completeness: Completeness | None
     presence: Mapping[str, Presence]
     serial: str
+    steps: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -291,7 +293,13 @@ class _SpecimenCounts:
         last = self._last
         presence = {} if last is None else {name: one.presence for name, one in last.components.items()}
         completeness = None if last is None else last.completeness
-        return SpecimenSummary(dict(self._states), completeness, presence, self._serial)
+        return SpecimenSummary(
+            dict(self._states),
+            completeness,
+            presence,
+            self._serial,
+            () if last is None or last.steps is None else (last.steps.text, *(one[0] for one in last.steps.history)),
+        )
 
 
 class _OutputFiles:
@@ -317,7 +325,7 @@ class _OutputFiles:
             self._drawer.put(frame, poses)
         if self._poses is not None:
             for pose in poses:
-                self._poses.write(pose, frame.file)
+                self._poses.write(pose, frame.file, frame.image)
 
     def finish_drawing(self) -> None:
         """Wait until all frames are drawn."""
@@ -397,6 +405,7 @@ def _specimen_lines(name: str, specimen: SpecimenSummary) -> list[str]:
         names.setdefault(presence, []).append(component)
     named = (Presence.MISSING, Presence.DISPLACED)
     found = [f"{len(some)} {one}" + (f" ({', '.join(some)})" if one in named else "") for one, some in names.items()]
+    lines += [f"{title}steps: {'; '.join(specimen.steps)}"] if specimen.steps else []
     return [*lines, f"{title}components {specimen.completeness}: {', '.join(found)}"]
 
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from math import isfinite
 from types import MappingProxyType
 from typing import Any
 
-from arview.core.messages import sentence
+from arview.core.messages import key_of, sentence
 from arview.geometry import Array
 
 
@@ -35,6 +35,12 @@ class Presence(StrEnum):
     """Its nominal place was seen without it."""
     DISPLACED = "displaced"
     """Not seen at its nominal place but at another, see `ComponentPresence.model_from_nominal`."""
+    NEXT = "next"
+    """A step of the assembly that mounts it is to be done now."""
+    LATER = "later"
+    """A later step mounts it."""
+    WRONG = "wrong"
+    """It is to be mounted now, and something else stands at its place."""
 
 
 class Visibility(StrEnum):
@@ -93,6 +99,71 @@ class Identity(StrEnum):
     """A serial code in the picture names another specimen than the inspection: labels are withheld."""
 
 
+@dataclass(frozen=True)
+class StepReport:
+    """How far the assembly of a part is, by the steps of its part file; all tuples but the last two have one of each.
+
+    Attributes:
+        names, components: of the steps.
+        is_current: the step is to be done now: all before it are done.
+        started_s: time stamp of the frame since which it is to be done; None: not yet.
+        done_s: time stamp of the frame in which the last of its components was first seen; None: it is not done.
+        faults: what is wrong now, one sentence for each fault: wrong order, wrong part, or a component that is gone.
+        history: all faults so far, each with the time stamps at which it began and ended; None: it has not ended.
+    """
+
+    names: tuple[str, ...]
+    components: tuple[tuple[str, ...], ...]
+    is_current: tuple[bool, ...]
+    started_s: tuple[float | None, ...]
+    done_s: tuple[float | None, ...]
+    faults: tuple[str, ...] = ()
+    history: tuple[tuple[str, float, float | None], ...] = ()
+
+    @property
+    def text(self) -> str:
+        """What is to be done now, in one sentence, such as ``3/12 mount post_3``."""
+        count, waiting = len(self.names), [k for k, done_s in enumerate(self.done_s) if done_s is None]
+        if not waiting:
+            return sentence("steps.done", count=count)
+        name, listed = self.names[waiting[0]], ", ".join(self.components[waiting[0]])
+        key = "steps.mount" if name == listed else "steps.named"
+        return sentence(key, number=waiting[0] + 1, count=count, names=listed, name=name)
+
+    def rows(self) -> list[dict[str, object]]:
+        """Each step as JSON values: step, name, components, state, started_s, done_s; then each fault so far: fault,
+        kind, began_s, ended_s.
+        """
+        columns = zip(self.names, self.components, self.is_current, self.started_s, self.done_s, strict=True)
+        steps: list[dict[str, object]] = [
+            {
+                "step": number,
+                "name": name,
+                "components": list(components),
+                "state": "done" if done_s is not None else "current" if is_current else "locked",
+                "started_s": started_s,
+                "done_s": done_s,
+            }
+            for number, (name, components, is_current, started_s, done_s) in enumerate(columns, 1)
+        ]
+        faults: list[dict[str, object]] = [
+            {"fault": text, "kind": key_of(text).removeprefix("steps."), "began_s": began_s, "ended_s": ended_s}
+            for text, began_s, ended_s in self.history
+        ]
+        return steps + faults
+
+    def since(self, zero_s: float) -> StepReport:
+        """The same with times from another zero, a time stamp."""
+        started_s, done_s = (
+            tuple(None if one is None else one - zero_s for one in times) for times in (self.started_s, self.done_s)
+        )
+        history = tuple(
+            (text, began_s - zero_s, None if ended_s is None else ended_s - zero_s)
+            for text, began_s, ended_s in self.history
+        )
+        return replace(self, started_s=started_s, done_s=done_s, history=history)
+
+
 MAX_NAMES = 3
 """Unverified components listed by name in a status line; of more than these only the number is given."""
 
@@ -124,6 +195,7 @@ class Pose:
         identity_reason: why the identity is unconfirmed or another, in words that say what to do.
         serial: serial number read from a code on the part in view, or empty.
         instance: names the part and which specimen of it this is where several are tracked at once, or empty.
+        steps: of the assembly; None of a part without steps.
     """
 
     cam_from_model: Array | None
@@ -143,6 +215,7 @@ class Pose:
     identity_reason: str = ""
     serial: str = ""
     instance: str = ""
+    steps: StepReport | None = None
 
     def __repr__(self) -> str:
         if self.cam_from_model is None:
@@ -162,6 +235,7 @@ class Pose:
         Of a pose, ``presence`` maps each component to its `Presence`, ``presence_details`` to its visibility,
         probability, observations, spread_deg and, if it is displaced, model_from_nominal (4×4). ``completeness`` is a
         summary; ``identity``, ``identity_reason``, ``serial`` and ``instance`` say which specimen is meant.
+        ``steps``, of a part that has them, holds what is to be done (``text``) and what is wrong (``faults``).
         """
         covariance = None if self.covariance is None else self.covariance.tolist()
         if covariance is not None and not all(isfinite(value) for row in covariance for value in row):
@@ -179,6 +253,7 @@ class Pose:
             "unverified": list(self.unverified),
             "alternatives": [alternative.tolist() for alternative in self.alternatives],
             **self._specimen(),
+            **({} if self.steps is None else {"steps": {"text": self.steps.text, "faults": list(self.steps.faults)}}),
         }
 
     def _specimen(self) -> dict[str, object]:

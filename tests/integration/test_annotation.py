@@ -8,12 +8,14 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
 from arview.annotation import QUEUED_FRAMES, annotate
+from arview.core.messages import sentence
 from arview.errors import InputError, OutputError
-from arview.pose import Pose, TrackingState
+from arview.pose import Pose, StepReport, TrackingState
 from arview.pose_file import PoseWriter, pose_line
 from arview.video import Frame, FrameSource, Image, VideoSink, open_source
 from helpers.video_files import number_of, numbered
@@ -198,3 +200,55 @@ def test_covariance_that_is_not_finite_is_null() -> None:
 def test_sink_without_overlay_is_refused() -> None:
     with pytest.raises(ValueError, match="overlay"):
         annotate(Pictures(1), Walk(), sink=Hole())
+
+
+class Worker:
+    """A session of a part with two steps; the first is done in the sixth frame, after another part stood there."""
+
+    def process(self, image: Image, index: int, time_s: float) -> tuple[Pose, ...]:
+        fault = sentence("steps.wrong_part", name="post")
+        steps = StepReport(
+            names=("post", "both nuts"),
+            components=(("post",), ("nut_1", "nut_2")),
+            is_current=(index < 5, index >= 5),
+            started_s=(0.0, 0.5 if index >= 5 else None),
+            done_s=(0.5 if index >= 5 else None, None),
+            faults=(fault,) if 2 <= index < 5 else (),
+            history=((fault, 0.2, 0.5 if index >= 5 else None),) if index >= 2 else (),
+        )
+        return (Pose(np.eye(4), np.eye(6), 0.9, TrackingState.TRACKED, time_s, index, 1.5, steps=steps),)
+
+
+def test_steps_are_written_with_a_photo_of_each(tmp_path: Path) -> None:
+    path = tmp_path / "poses.jsonl"
+    summary = annotate(Pictures(10), Worker(), poses_path=path)
+    lines = [json.loads(line) for line in path.read_text().splitlines()]
+    assert lines[3]["steps"] == {"text": "1/2 mount post", "faults": ["wrong part in the place of post"]}
+    assert lines[9]["steps"] == {"text": "2/2 both nuts: mount nut_1, nut_2", "faults": []}
+    post, nuts, fault = (json.loads(line) for line in (tmp_path / "poses.steps.jsonl").read_text().splitlines())
+    assert post == {
+        "step": 1,
+        "name": "post",
+        "components": ["post"],
+        "state": "done",
+        "started_s": 0.0,
+        "done_s": 0.5,
+        "photo": "01.jpg",
+    }
+    assert nuts["state"] == "current" and nuts["done_s"] is None and nuts["photo"] == ""
+    assert fault == {
+        "fault": "wrong part in the place of post",
+        "kind": "wrong_part",
+        "began_s": 0.2,
+        "ended_s": 0.5,
+    }
+    photo = cv2.imread(str(tmp_path / "poses.steps" / "01.jpg"))
+    assert photo is not None and number_of(np.asarray(photo[..., ::-1], dtype=np.uint8)) == 5
+    assert left_over(tmp_path) == ["poses.jsonl", "poses.steps", "poses.steps.jsonl"]
+    assert summary.specimens[""].steps == ("2/2 both nuts: mount nut_1, nut_2", "wrong part in the place of post")
+
+
+def test_a_failed_run_leaves_no_steps(tmp_path: Path) -> None:
+    with pytest.raises(InputError):
+        annotate(Pictures(10, 8, InputError("dead")), Worker(), poses_path=tmp_path / "poses.jsonl")
+    assert not left_over(tmp_path)

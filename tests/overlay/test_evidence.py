@@ -12,14 +12,15 @@ from numpy.typing import NDArray
 from overlay.test_overlay import CAMERA, GREY, NOW, box, deviation, inspection, orbit, pose, post
 
 from arview.cad.model import Model, make_model
+from arview.core.messages import sentence
 from arview.geometry import apply, rigid
 from arview.inspection import ComponentDeviation, Finding, Inspection, Verdict
 from arview.overlay import OverlayOptions, OverlayRenderer, labels
 from arview.overlay.annotations import LaidOutLabel
-from arview.overlay.evidence import DISPLACED_RGB, DrawnEvidence
+from arview.overlay.evidence import DISPLACED_RGB, NEXT_RGB, DrawnEvidence
 from arview.overlay.legend import legend_entries
 from arview.overlay.status import completeness_text
-from arview.pose import ComponentPresence, Identity, Pose, Presence, Visibility
+from arview.pose import ComponentPresence, Identity, Pose, Presence, StepReport, Visibility
 
 MOVED = rigid(np.eye(3), [40.0, 0.0, 0.0])
 BARE = {"show_labels": False, "show_status": False, "show_legend": False}
@@ -246,3 +247,39 @@ def test_missing_components_are_labelled_without_an_inspection(model: Model) -> 
     assert renderer.laid_out.labels == ()
     renderer.draw(GREY, posed({"p2": seen(Presence.MISSING)}), now=NOW)
     assert [one.lines for one in renderer.laid_out.labels] == [("p2", "MISSING")]
+
+
+def test_the_next_component_is_ghosted_and_later_ones_are_not_drawn(model: Model) -> None:
+    steps = StepReport(
+        ("p0", "p1", "p2"), (("p0",), ("p1",), ("p2",)), (False, True, False), (0.0,) * 3, (1.0, None, None)
+    )
+    awaited = posed({"p1": seen(Presence.NEXT), "p2": seen(Presence.LATER)})
+    renderer = OverlayRenderer(model, CAMERA, options=OverlayOptions(show_status=False))
+    picture = renderer.draw(GREY, replace(awaited, steps=steps))
+    found = label(renderer, "p1").text
+    assert (
+        found.word == "NEXT" and found.rgb == NEXT_RGB and [one.text.name for one in renderer.laid_out.labels] == ["p1"]
+    )
+    bare = OverlayRenderer(model, CAMERA, options=OverlayOptions(**BARE))
+    ghosts = bare.draw(GREY, replace(awaited, steps=steps))
+    red, _, blue = ghosts[place_of("p1", model)].reshape(-1, 3).mean(axis=0)
+    assert red > blue + 40
+    # Where the last one is to come the picture shows the base alone, as if the model ended there.
+    without = OverlayRenderer(make_model("plate", model.components[:3]), CAMERA, options=OverlayOptions(**BARE))
+    expected = without.draw(GREY, replace(awaited, components=dict(list(awaited.components.items())[:3])))
+    assert changed(ghosts, expected)[place_of("p2", model)].max() <= 2
+    assert changed(picture)[place_of("p0", model)].max() > 20
+
+
+def test_a_wrong_part_is_hatched_and_named(model: Model) -> None:
+    fault = sentence("steps.wrong_part", name="p1")
+    steps = StepReport(("p1",), (("p1",),), (True,), (0.0,), (None,), (fault,), ((fault, 1.0, None),))
+    renderer = OverlayRenderer(model, CAMERA)
+    named = replace(posed({"p1": seen(Presence.WRONG)}), steps=steps)
+    picture = renderer.draw(GREY, named)
+    assert label(renderer, "p1").text.word == "WRONG PART"
+    calm = renderer.draw(GREY, replace(named, steps=replace(steps, faults=())))
+    top = np.s_[: CAMERA.height // 10]
+    assert changed(picture, calm)[top].max() > 40
+    entries = dict(legend_entries([DrawnEvidence.WRONG, DrawnEvidence.NEXT, DrawnEvidence.LATER]))
+    assert list(entries.values()) == ["another part at its place", "to be mounted now"]

@@ -25,6 +25,8 @@ MIN_PIXELS = 12
 """Pixels of a place, or of a reference, with fewer of which it says nothing."""
 REACH_PX = (10.0, 40.0)
 """Smallest and largest distance from a place at which the same face is its reference."""
+BRIDGED_PX = 6.0
+"""Pixels beside a place, many of them near an edge and not compared, that do not part it from what goes on there."""
 NORMAL_STEPS = 4.0
 """Steps per unit in which normals are rounded to group pixels into faces."""
 MAX_DEVIATIONS = 3.0
@@ -56,6 +58,7 @@ class BarePlaces(NamedTuple):
         ring: share of the reference pixels beside the place that have the colour of their face elsewhere.
         around: share of trusted components' edge points near the place that lie on image edges.
         behind: the same of the base's edge points that the component would hide.
+        extent: how far what is not as it should be goes on beside the place, in reaches of the reference.
     """
 
     bare: Array
@@ -63,6 +66,7 @@ class BarePlaces(NamedTuple):
     ring: Array
     around: Array
     behind: Array
+    extent: Array
 
 
 class _Colours(NamedTuple):
@@ -115,8 +119,7 @@ class BarePlaceMeter:
             edge_points: of trusted components.
             behind: of the base alone.
         """
-        found = np.full((5, self._count), -1.0)
-        places = BarePlaces(found[0], found[1], found[2], found[3], found[4])
+        places = BarePlaces(*np.full((6, self._count), -1.0))
         if not is_wanted.any():
             return places
         shape = image.shape[:2]
@@ -143,7 +146,7 @@ class BarePlaceMeter:
             compared = inside & is_inner[window] & (bare.owners[window] >= 0)
             places.coverage[c] = np.count_nonzero(compared) / max(int(np.count_nonzero(inside)), 1)
             if np.count_nonzero(compared) >= MIN_PIXELS:
-                places.bare[c], places.ring[c] = self._compare(
+                places.bare[c], places.ring[c], places.extent[c] = self._compare(
                     smooth[window], bare.faces[window], compared, is_sure[window], distance, colours
                 )
         return places
@@ -200,8 +203,9 @@ class BarePlaceMeter:
         is_sure: NDArray[np.bool_],
         distance: NDArray[np.float32],
         colours: dict[int, _Colours],
-    ) -> tuple[float, float]:
-        """Shares `bare` and `ring` of one place, weighted by the pixels of the faces behind it; -1 without reference.
+    ) -> tuple[float, float, float]:
+        """Shares `bare` and `ring` of one place, weighted by the pixels of the faces behind it, and its `extent`; -1
+        without reference.
 
         Args:
             image, faces, compared, is_sure, distance: (H,W) around the place: colours, faces behind it, its pixels,
@@ -210,26 +214,37 @@ class BarePlaceMeter:
         """
         reach = float(np.clip(0.8 * np.sqrt(np.count_nonzero(compared)), *REACH_PX))
         beside = is_sure & (distance > 2.0) & (distance < reach)
-        bare, ring, ringed, weight = 0.0, 0.0, 0.0, 0.0
+        bare, like, ring, ringed, weight = 0.0, 0.0, 0.0, 0.0, 0.0
+        strange = (distance < BRIDGED_PX).astype(np.uint8)
         values, counts = np.unique(faces[compared], return_counts=True)
         for value, count in zip(values, counts, strict=True):
             everywhere = colours.get(int(value))
             if everywhere is None:
                 continue
-            near = image[beside & (faces == value)]
+            is_near = beside & (faces == value)
+            near = image[is_near]
             used = everywhere
             if len(near) >= MIN_PIXELS:
-                ring += count * _share(near, everywhere, MAX_DEVIATIONS)
+                is_like = _is_like(near, everywhere, MAX_DEVIATIONS)
+                strange[is_near] = ~is_like
+                ring += count * float(np.mean(is_like))
                 ringed += count
                 local = self._colours(near)
                 apart = np.abs(local.median - everywhere.median) / everywhere.deviation
                 used = local if apart.max() < MAX_DEVIATIONS else everywhere
             pixels = image[compared & (faces == value)]
-            bare += count * _share(pixels, used, MAX_DEVIATIONS) * self._texture_match(pixels, everywhere)
+            is_like = _is_like(pixels, used, MAX_DEVIATIONS)
+            like += count * float(np.mean(is_like))
+            bare += count * float(np.mean(is_like)) * self._texture_match(pixels, everywhere)
             weight += count
         if weight < max(MIN_PIXELS, 0.3 * np.count_nonzero(compared)):
-            return -1.0, -1.0
-        return bare / weight, ring / ringed if ringed > 0 else -1.0
+            return -1.0, -1.0, -1.0
+        # Single pixels of another colour are noise; a hand or a tool is connected with the place, and goes on.
+        joined = cv2.connectedComponents(cv2.morphologyEx(strange, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)))[1]
+        goes_on = distance[np.isin(joined, joined[(distance == 0.0) & (joined > 0)])]
+        # What differs in its texture alone has no border.
+        extent = 1.0 if like > 0.5 * weight > bare else float(np.max(goes_on, initial=0.0)) / reach
+        return bare / weight, ring / ringed if ringed > 0 else -1.0, extent
 
     def _texture_match(self, pixels: NDArray[np.float32], colours: _Colours) -> float:
         """1 where the brightness of some pixels (N,3) varies like that of their face, less where it is smoother."""
@@ -266,10 +281,10 @@ def _opponent_colours(image: NDArray[Any]) -> NDArray[np.float32]:
     return np.stack([(red + green + blue) / 3.0, red - green, 0.5 * (red + green) - blue], axis=2)
 
 
-def _share(pixels: NDArray[np.float32], colours: _Colours, max_deviations: float) -> float:
-    """Share of some pixels (N,3) that have the colours."""
+def _is_like(pixels: NDArray[np.float32], colours: _Colours, max_deviations: float) -> NDArray[np.bool_]:
+    """(N,) which of some pixels (N,3) have the colours."""
     apart = np.max(np.abs(pixels - colours.median) / colours.deviation, axis=1)
-    return float(np.mean(apart < max_deviations))
+    return np.asarray(apart < max_deviations)
 
 
 def _is_inner(drawing: _Drawing, border_px: int) -> NDArray[np.bool_]:

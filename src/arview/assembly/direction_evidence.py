@@ -86,6 +86,10 @@ class DirectionEvidence:
         found.spreads_deg = np.where(is_known, self.spreads_deg[source], 0.0)
         return found
 
+    def forget(self, is_meant: NDArray[np.bool_]) -> None:
+        """Forget what was observed of some components (C,)."""
+        self._counts[:, is_meant] = self._sums[:, is_meant] = 0.0
+
     def _widen_spreads(self, direction: Array, is_observed: NDArray[np.bool_]) -> None:
         """Take a new observation of some components into account in their spreads."""
         angles_deg = np.rad2deg(np.arccos(np.clip(self._directions @ direction, -1.0, 1.0)))

@@ -19,6 +19,7 @@ from arview.assembly.observation import ComponentObserver, Known, base_of
 from arview.assembly.observation_schedule import INCOMPLETE_QUALITY, ObservationSchedule
 from arview.assembly.presence_report import PresenceReport
 from arview.assembly.present_lines import PresentLines
+from arview.assembly.steps import StepMonitor
 from arview.assembly.turned_poses import Turn, TurnedPoses
 from arview.cad import Model
 from arview.camera import Camera
@@ -48,6 +49,7 @@ class AssemblyMonitor:
         observer: observes the components in single pictures.
         is_placed: whether the pose is known to be that of the part; of one that rests on the base alone nothing is
             called missing.
+        steps: follows the steps of the assembly; None of a part without steps.
     """
 
     _state: MonitorState
@@ -70,22 +72,24 @@ class AssemblyMonitor:
         self._is_base = np.arange(len(model.components)) == self.observer.base
         self._schedule = ObservationSchedule(self.observer)
         self._report = PresenceReport(model, camera, self.observer, self._turned)
+        self.steps = StepMonitor(model, self.observer.base) if model.steps else None
         self.forget()
 
     @property
     def mismatches(self) -> tuple[str, ...]:
         """One message for each component that is not where the CAD has it."""
-        return _messages(self._views.component_names, self._state.is_mismatched)
+        return _messages(self._views.component_names, self._state.is_mismatched & ~self._is_awaited)
 
     @property
     def uncertain(self) -> tuple[str, ...]:
         """Names of components that must be observed again before the part is called right."""
-        return _named(self._views.component_names, self._state.is_uncertain)
+        return _named(self._views.component_names, self._state.is_uncertain & ~self._is_awaited)
 
     @property
     def unverified(self) -> tuple[str, ...]:
         """Names of components not yet confirmed at their nominal placement; none of a part of one component."""
-        return _named(self._views.component_names, ~self._state.is_verified) if self._has_components else ()
+        is_open = ~self._state.is_verified & ~self._is_awaited
+        return _named(self._views.component_names, is_open) if self._has_components else ()
 
     @property
     def is_bare(self) -> bool:
@@ -114,11 +118,14 @@ class AssemblyMonitor:
         """The turn to a pose that fits clearly better; None: no other does."""
         return self._turned.better
 
-    def turn(self, turn: Turn) -> None:
-        """Take a turned pose: what was seen of a place is known of the component that belongs there now.
+    def turn(self, turn: Turn | None = None) -> None:
+        """Take a turned pose, the better one if none is given: what was seen of a place is known of the component that
+        belongs there now.
 
         If the part was lost before, and this turn had been ruled out by then, what was known then holds again.
         """
+        turn = turn or self._turned.better
+        assert turn is not None
         before, was_resumed = self._state, self._is_resumed
         known = self._memory.before_turn(self._turned.index_of(turn)) if was_resumed else None
         self.reset()
@@ -162,6 +169,8 @@ class AssemblyMonitor:
     def forget(self) -> None:
         """Forget all observations, those set aside too."""
         self._memory = LossMemory()
+        if self.steps is not None:
+            self.steps.forget()
         self.reset()
 
     def reset(self, is_placed: bool = True) -> None:
@@ -174,9 +183,18 @@ class AssemblyMonitor:
         self.is_placed, self._is_resumed = is_placed, False
         self._report.forget()
         self._state = MonitorState.unknown(len(self._views.component_names), self._views.center_in_model)
+        self._is_awaited = np.zeros_like(self._is_base)
+        if self.steps is not None:
+            self.steps.restart()
+            self._is_awaited = self.steps.is_awaited
 
     def update(
-        self, image: NDArray[np.uint8], cam_from_model: Array, quality: float = 1.0, is_supported: bool = True
+        self,
+        image: NDArray[np.uint8],
+        cam_from_model: Array,
+        quality: float = 1.0,
+        is_supported: bool = True,
+        time_s: float = 0.0,
     ) -> None:
         """Process a frame; it is observed only if its pose is good and it may add evidence.
 
@@ -185,22 +203,27 @@ class AssemblyMonitor:
             cam_from_model: (4,4) mm.
             quality: of the pose; if it is low, perhaps further components are absent.
             is_supported: the pose is sure.
+            time_s: time stamp of the frame.
         """
         state = self._state
         state.frames_since += 1
         before, state.last_pose = state.last_pose, cam_from_model
+        slow, fast = MOTION_PX
+        sharp = float(np.clip((fast - self.observer.motion_px(before, cam_from_model)) / (fast - slow), 0.0, 1.0))
+        if self.steps is not None:
+            self.steps.follow(self.observer, state, image if is_supported else None, time_s, is_sharp=sharp == 1.0)
+            self._is_awaited = self.steps.is_awaited
         # From a new direction the lines of absent components that were not seen before are missed.
-        is_urgent = quality < INCOMPLETE_QUALITY and bool(state.is_suspect.any())
+        is_urgent = quality < INCOMPLETE_QUALITY and bool((state.is_suspect & ~self._is_awaited).any())
         if not self._has_components or not (is_supported or is_urgent):
             return
         if not self._schedule.is_due(state, cam_from_model, is_urgent):
             return
         searched = self._schedule.searched(state, self._memory.aside is not None)
-        known = Known(state.is_verified, state.is_mismatched, searched)
+        known = Known(state.is_verified, state.is_mismatched, searched & ~self._is_awaited, self._is_awaited)
         observation = self.observer.observe(image, cam_from_model, known)
-        slow, fast = MOTION_PX
-        sharp = float(np.clip((fast - self.observer.motion_px(before, cam_from_model)) / (fast - slow), 0.0, 1.0))
         state.add(observation, cam_from_model, sharp, self._views.diameter_mm)
+        state.assume(self._is_awaited, is_there=False)
         if is_supported and state.is_suspect.any():
             self._turned.compare(cam_from_model, lambda pose: self.observer.pose_evidence(image, pose))
 
@@ -249,7 +272,8 @@ class AssemblyMonitor:
         if not self._has_components:
             return {}
         may_be_missing = self.is_placed or not self.is_bare
-        return self._report.presence(self._state, cam_from_model, is_ambiguous, may_be_missing)
+        awaited = () if self.steps is None else self.steps.presences
+        return self._report.presence(self._state, cam_from_model, is_ambiguous, may_be_missing, awaited)
 
     def mismatches_in(self, image: NDArray[np.uint8], cam_from_model: Array) -> tuple[str, ...]:
         """Mismatches by one picture alone; the state of the monitor is neither used nor changed."""

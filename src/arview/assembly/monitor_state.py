@@ -132,6 +132,17 @@ class MonitorState:
             self.is_mismatched = self.log_odds > mismatched_above
         self.is_missing = self.is_mismatched & (self.is_missing | (self.log_odds > MISSING_LOG_ODDS))
 
+    def assume(self, is_meant: NDArray[np.bool_], is_there: bool) -> None:
+        """Take some components (C,) as surely there, or not there, and forget all pictures of them before."""
+        self.log_odds = np.where(
+            is_meant, VERIFIED_LOG_ODDS - 0.5 if is_there else SETTLED_LOG_ODDS + 0.5, self.log_odds
+        )
+        self.is_verified = np.where(is_meant, is_there, self.is_verified)
+        self.is_mismatched = np.where(is_meant, not is_there, self.is_mismatched)
+        self.is_missing = np.where(is_meant, not is_there, self.is_missing)
+        self.alternative = np.where(is_meant, 0.0, self.alternative)
+        self.directions.forget(is_meant)
+
     def _add_alternatives(self, observation: Observation, same_mm: float) -> None:
         """Add the evidence of one observation for alternative placements, as long as these are the same."""
         is_searched = np.isfinite(observation.alternative)

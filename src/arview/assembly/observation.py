@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.assembly.bare_place import BarePlaceMeter
-from arview.assembly.edge_support import POINTS, EdgeSupportMeter
+from arview.assembly.bare_place import BarePlaceMeter, BarePlaces
+from arview.assembly.edge_support import POINTS, EdgeSupportMeter, MeasuredSupport
 from arview.assembly.log_odds import Evidence, edge_log_odds, place_log_odds, place_odds
 from arview.assembly.placement_search import Alternatives, PlacementSearch
 from arview.assembly.placements import alternative_placements
@@ -43,6 +43,12 @@ TRUSTED_LOG_ODDS = -2.0
 behind absent ones."""
 SUSPECT_LOG_ODDS = 1.0
 """Components with more are suspects."""
+MIN_OPEN, MIN_AROUND = 0.75, 0.45
+"""A place is open where more of the pixels beside it look as they should; share of the edges around it from which on
+these are found."""
+MAX_EXTENT = (0.65, 0.35)
+"""How far beside an open place what stands there may go on, see `BarePlaces`, if the edges around are found, and if
+not: a hand or a tool goes on to the border of the picture."""
 POSE_FOUND = (0.4, 0.55)
 """Share of the edge points of the base, and of others that are there, up to which the pose counts as wrong, and from
 which on it counts as right."""
@@ -61,11 +67,13 @@ class Known(NamedTuple):
         is_present: seen at their nominal placement.
         is_absent: seen not to be there: they hide nothing.
         is_searched: to be searched for at alternative placements.
+        is_awaited: not mounted yet: they are not measured; None: all are mounted.
     """
 
     is_present: NDArray[np.bool_]
     is_absent: NDArray[np.bool_]
     is_searched: NDArray[np.bool_]
+    is_awaited: NDArray[np.bool_] | None = None
 
 
 def nothing_known(count: int) -> Known:
@@ -91,6 +99,20 @@ class Observation(NamedTuple):
     is_occluded: NDArray[np.bool_]
     alternative: Array
     shifts: Array
+
+
+class Glimpse(NamedTuple):
+    """What one picture shows at places of components without any network; all (C,).
+
+    Attributes:
+        by_edges: log odds of "not at its nominal placement" to "there" by the edges alone; 0 where it is not visible.
+        bare: share of the place that looks as it does without the component; -1: not known.
+        is_open: nothing before the place interrupts what is beside it.
+    """
+
+    by_edges: Array
+    bare: Array
+    is_open: NDArray[np.bool_]
 
 
 class PartCrop(NamedTuple):
@@ -180,13 +202,41 @@ class ComponentObserver:
     ) -> tuple[Evidence, PartImage | None]:
         """All measurements but the search for alternative placements, and the picture around the part for that."""
         crop = self._part_crop(image, cam_from_model)
+        measured, is_doubtful, places, base = self._measure_places(crop, cam_from_model, known)
+        network, picture = np.full(self._count, np.nan), None
+        if (is_doubtful | known.is_searched).any():
+            picture = PartImage(crop.image, self._edge_net.predict(crop.image), crop.intrinsics, crop.cam_from_body)
+            network = self._network_log_odds(picture, known, is_doubtful)
+        return Evidence(*measured, network, places, base), picture
+
+    def glimpse(self, image: NDArray[np.uint8], cam_from_model: Array, known: Known) -> Glimpse | None:
+        """What a picture shows of components that may be mounted at any time; None where the pose may be wrong.
+
+        Args:
+            image: (H,W,3) uint8 RGB of the camera's size.
+            cam_from_model: (4,4) mm, exact to a pixel or two.
+            known: of the components; only places of those that are neither seen nor awaited are looked at.
+        """
+        measured, _, places, base = self._measure_places(self._part_crop(image, cam_from_model), cam_from_model, known)
+        if base < POSE_FOUND[1]:
+            return None
+        is_open = (places.ring > MIN_OPEN) & (places.extent < np.where(places.around > MIN_AROUND, *MAX_EXTENT))
+        return Glimpse(edge_log_odds(measured), places.bare, is_open)
+
+    def _measure_places(
+        self, crop: PartCrop, cam_from_model: Array, known: Known
+    ) -> tuple[MeasuredSupport, NDArray[np.bool_], BarePlaces, float]:
+        """Edges of all components, (C,) which of them the edges leave doubtful, the places of these, and the share of
+        the edge points of trusted components that are found.
+        """
         edges = self._visible_edges.nearest(cam_from_model, known.is_absent)
         measured = self._meter.measure(
             crop.image, edges, crop.cam_from_body, crop.intrinsics, crop.px_per_mm, known.is_absent
         )
-        is_visible = measured.support.supported >= 0.0
         by_edges = edge_log_odds(measured)
-        is_doubtful = is_visible & (by_edges > CONFIRMED_LOG_ODDS)
+        is_doubtful = (measured.support.supported >= 0.0) & (by_edges > CONFIRMED_LOG_ODDS)
+        if known.is_awaited is not None:
+            is_doubtful &= ~known.is_awaited
         is_trusted = known.is_present | (by_edges < TRUSTED_LOG_ODDS)
         is_trusted[self.base] = True
         points = self._meter.found_points(edges, is_trusted)
@@ -201,12 +251,8 @@ class ComponentObserver:
             points,
             self._meter.found_behind(self._base_edges.nearest(cam_from_model), points.shift),
         )
-        network, picture = np.full(self._count, np.nan), None
-        if (is_doubtful | known.is_searched).any():
-            picture = PartImage(crop.image, self._edge_net.predict(crop.image), crop.intrinsics, crop.cam_from_body)
-            network = self._network_log_odds(picture, known, is_doubtful)
         base = float(np.mean(points.is_found)) if len(points.is_found) else 0.0
-        return Evidence(*measured, network, places, base), picture
+        return measured, is_doubtful, places, base
 
     def pose_evidence(self, image: NDArray[np.uint8], cam_from_model: Array) -> TurnEvidence:
         """How much of the base, and of components at their nominal placements, a picture shows at a pose."""

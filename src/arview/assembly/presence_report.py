@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from types import MappingProxyType
 
 import numpy as np
@@ -51,12 +52,17 @@ class PresenceReport:
 
     def forget(self) -> None:
         """Another state follows: nothing that was reported holds any longer."""
-        self._last: tuple[tuple[int, bool, bool, bytes], Mapping[str, ComponentPresence]] | None = None
+        self._last: tuple[tuple[object, ...], Mapping[str, ComponentPresence]] | None = None
         self._visibility: tuple[int, Array, NDArray[np.int8]] | None = None
         self._frames = 0
 
     def presence(
-        self, state: MonitorState, cam_from_model: Array, is_ambiguous: bool, may_be_missing: bool
+        self,
+        state: MonitorState,
+        cam_from_model: Array,
+        is_ambiguous: bool,
+        may_be_missing: bool,
+        awaited: tuple[Presence | None, ...] = (),
     ) -> Mapping[str, ComponentPresence]:
         """Presence of each component by its name; the same mapping as long as nothing changes.
 
@@ -65,6 +71,7 @@ class PresenceReport:
             cam_from_model: (4,4) mm pose of the present frame, for the visibility.
             is_ambiguous: other poses fit as well, in which components other than the base would be elsewhere.
             may_be_missing: whether the pose is known well enough to call a component missing.
+            awaited: presence of each component that is not mounted yet, None of the others; empty: all are mounted.
         """
         self._frames += 1
         last = self._visibility
@@ -72,9 +79,11 @@ class PresenceReport:
         if last is None or not (is_kept and are_near(cam_from_model, last[1], self._jump_mm, JUMP_DEG)):
             last = self._visibility = state.observations, cam_from_model, self._visibilities(state, cam_from_model)
         visibilities = last[2]
-        key = (state.observations, is_ambiguous, may_be_missing, visibilities.tobytes())
+        key = (state.observations, is_ambiguous, may_be_missing, visibilities.tobytes(), awaited)
         if self._last is None or self._last[0] != key:
             found = self._presence_now(state, visibilities, is_ambiguous, may_be_missing)
+            expected = {name: one for name, one in zip(self._names, awaited, strict=False) if one is not None}
+            found |= {name: replace(found[name], presence=one) for name, one in expected.items()}
             self._last = key, MappingProxyType(found)
         return self._last[1]
 

@@ -72,6 +72,21 @@ class Component:
 
 
 @dataclass(frozen=True)
+class Step:
+    """A step of the assembly, in which components are mounted.
+
+    Attributes:
+        name: as it is shown and recorded.
+        mount: names of the components.
+        after: names of the steps that must be done before.
+    """
+
+    name: str
+    mount: tuple[str, ...]
+    after: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
 class Model:
     """An assembly of named components.
 
@@ -80,6 +95,7 @@ class Model:
         components: with unique names.
         source_hash: SHA-256 of names, vertices rounded to a micrometre and faces, by which guide views and inspections
             are checked.
+        steps: in which the components are mounted, in the order of the part file; empty: all are there from the start.
 
     Raises:
         InputError: no components, or a name that is not unique.
@@ -88,6 +104,7 @@ class Model:
     name: str
     components: tuple[Component, ...]
     source_hash: str
+    steps: tuple[Step, ...] = ()
 
     def __post_init__(self) -> None:
         if not self.components:

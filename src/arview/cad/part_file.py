@@ -29,6 +29,7 @@ from arview.cad.part import (
 )
 from arview.cad.rework_table import read_rework, read_rework_kinds
 from arview.cad.shape.symmetry import Symmetry
+from arview.cad.steps_table import read_steps
 from arview.cad.toml_table import TomlTable, vectors
 from arview.cad.view_range import UP_AXES, Up, ViewRange
 from arview.core.checks import PATH, check_type
@@ -38,7 +39,7 @@ ROLES = ("base", "inspect", "ignore")
 POINTS = ("mass", "seat", "axis", "hole")
 TABLES = (
     "part", "view_range", "guides", "defaults", "components", "symmetry", "datums", "features", "characteristics",
-    "rework",
+    "rework", "steps",
 )  # fmt: skip
 DATUM_FEATURES = ("plane", "hole", "pin", "slot", "cylinder", "edge", "point", "fit")
 
@@ -181,6 +182,16 @@ kind = "distance"              # of two features; gap: along the first one's nor
 of = ["bore_1", "post_1"]
 min_mm = 35.0
 # source = "drawing 4711, balloon 12"
+
+# The order of work: what each step mounts, one table for each. Components that no step mounts are there from the start.
+# `arview annotate` and the live page ghost the next component and name a wrong or missing one, see
+# docs/concepts/presence.md.
+# [[steps]]
+# mount = ["post_1"]           # components that are mounted together
+# name = "first post"          # default: the components
+# [[steps]]
+# mount = ["post_2", "nut_2"]
+# after = ["first post"]       # steps that must be done before; default: the one above; []: none
 """
 """A complete part file with comments; what `arview check --help` shows."""
 
@@ -295,6 +306,7 @@ def _read_part(root: TomlTable, path: Path, unit: str | None, load: Callable[...
     if not components:
         raise InputError(f"{path}: every component has the role 'ignore'; nothing is left to track")
     model = make_model(cad.model.name, tuple(components))
+    model = replace(model, steps=read_steps(root.tables("steps"), [component.name for component in components]))
     symmetries = tuple(
         _read_symmetry(table, tuple(model.center_in_model.tolist())) for table in root.tables("symmetry")
     )

@@ -196,6 +196,8 @@ def annotate(
         output = _default_output(source)
         say(f"no -o or --poses given: writing {output}")
     specimens = workflow.load_specimens(part_paths, instances, inspection_paths, unit)
+    if poses_path is None and output is not None and any(one.part.model.steps for one in specimens):
+        poses_path = str(Path(output).with_suffix(".jsonl"))
     if len(specimens) > 1:
         refuse_for_several({"--init": init, "--guideviews": views_path})
     guide_name = init.removeprefix(tracking.GUIDE_PREFIX) if init and init.startswith(tracking.GUIDE_PREFIX) else None

@@ -48,6 +48,13 @@ CATALOGUE = {
     "tracking.focal_changed": "the focal length has changed: {seen} px fit now, {given} px before ({percent} %); "
     "zoom, lens and stabiliser must stay as they were calibrated",
     "tracking.other_first": "another part is searched for first",
+    # The steps of an assembly.
+    "steps.mount": "{number}/{count} mount {names}",
+    "steps.named": "{number}/{count} {name}: mount {names}",
+    "steps.done": "all {count} steps done",
+    "steps.wrong_order": "wrong order: {name} before {others}",
+    "steps.wrong_part": "wrong part in the place of {name}",
+    "steps.missing": "{name} is gone",
     # Whether the specimen in view is the one that was measured.
     "identity.checking": "checking that this is the part that was followed before",
     "identity.another": "another part of this kind is in view; confirm that this is the one",
@@ -64,6 +71,8 @@ CATALOGUE = {
     "label.uncertain": "UNCERTAIN",
     "label.withheld": "WITHHELD",
     "label.seen": "SEEN",
+    "label.next": "NEXT",
+    "label.wrong": "WRONG PART",
     "verdict.pass": "PASS",
     "verdict.fail": "FAIL",
     "verdict.undecided": "UNDECIDED",
@@ -87,6 +96,8 @@ CATALOGUE = {
     "label.undetermined": "undetermined",
     "legend.missing": "missing here",
     "legend.displaced": "displaced: CAD place and where it is",
+    "legend.next": "to be mounted now",
+    "legend.wrong": "another part at its place",
     "legend.withheld": "another specimen: nothing measured is shown",
     "complete.yes": "COMPLETE",
     "complete.open": "NOT YET CHECKED",

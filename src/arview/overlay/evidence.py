@@ -19,6 +19,8 @@ MISSING_RGB: Rgb = (255, 72, 66)
 """Colour of the hatched ghost and the badge of a missing component."""
 DISPLACED_RGB: Rgb = (214, 122, 255)
 """Colour of both places of a displaced component."""
+NEXT_RGB: Rgb = (255, 236, 92)
+"""Colour of a component that is to be mounted now."""
 DIMMED_RGB: Rgb = (150, 158, 170)
 """Grey into which the colour of a verdict is mixed where the pictures do not support it."""
 PLAIN, STRIPES, CROSSES = 0, 1, 2
@@ -49,6 +51,12 @@ class DrawnEvidence(StrEnum):
     DISPLACED = "displaced"
     WITHHELD = "withheld"
     """The part in view may be another specimen: nothing measured is shown."""
+    NEXT = "next"
+    """To be mounted now."""
+    LATER = "later"
+    """To be mounted later: not drawn."""
+    WRONG = "wrong"
+    """To be mounted now, and something else stands at its place."""
 
     @property
     def is_open(self) -> bool:
@@ -58,15 +66,25 @@ class DrawnEvidence(StrEnum):
     @property
     def is_refuted(self) -> bool:
         """Whether the component was seen not to be at its nominal place."""
-        return self in (DrawnEvidence.MISSING, DrawnEvidence.DISPLACED)
+        return self in (DrawnEvidence.MISSING, DrawnEvidence.DISPLACED, DrawnEvidence.WRONG)
+
+    @property
+    def is_awaited(self) -> bool:
+        """Whether the component is still to be mounted, and nothing is wrong with that."""
+        return self in (DrawnEvidence.NEXT, DrawnEvidence.LATER)
 
 
+_AWAITED = {DrawnEvidence.NEXT: (0.6, 1.0, 1.0), DrawnEvidence.LATER: (0.0, 0.0, 0.0)}
+"""Opacity of ghost and edges, and weight, of components to be mounted; behind the next one is its bare place."""
 _EVIDENCE = {
     Presence.UNVERIFIED: DrawnEvidence.UNVERIFIED,
     Presence.UNCERTAIN: DrawnEvidence.UNCERTAIN,
     Presence.PRESENT: DrawnEvidence.SEEN,
     Presence.MISSING: DrawnEvidence.MISSING,
     Presence.DISPLACED: DrawnEvidence.DISPLACED,
+    Presence.NEXT: DrawnEvidence.NEXT,
+    Presence.LATER: DrawnEvidence.LATER,
+    Presence.WRONG: DrawnEvidence.WRONG,
 }
 
 
@@ -130,10 +148,10 @@ def component_styles(
         pattern = PLAIN
         if seen is DrawnEvidence.WITHHELD:
             color, opacity, edge_alpha = CONTEXT_RGB, 0.0, 1.0
+        elif seen.is_awaited:
+            color, (opacity, edge_alpha, cost) = NEXT_RGB, _AWAITED[seen]
         elif seen.is_refuted:
-            color, opacity = (
-                (MISSING_RGB, _HATCH_OPACITY) if seen is DrawnEvidence.MISSING else (DISPLACED_RGB, _HATCH_OPACITY)
-            )
+            color, opacity = DISPLACED_RGB if seen is DrawnEvidence.DISPLACED else MISSING_RGB, _HATCH_OPACITY
             pattern = CROSSES if seen is DrawnEvidence.MISSING else STRIPES
             edge_alpha, cost = 1.0, 1.0
         elif (seen.is_open or is_doubtful) and deviation is not None:

@@ -61,6 +61,7 @@ class Ghost:
         # Of a closed mesh only faces towards the camera are visible: 1, or -1 if it is wound inside out.
         winding = [(-1 if shape.is_inside_out else 1) if shape.is_closed else 0 for shape in shapes]
         self._winding = np.array(winding, dtype=np.int8)[self._component_of_face]
+        self._all_faces = self._faces, self._winding, self._component_of_face
         self._distortion_limit_r2 = _monotone_limit_r2(camera)
         self._ideal_pixels = _ideal_pixels(camera) if camera.is_distorted else None
 
@@ -83,6 +84,12 @@ class Ghost:
         """Pixels (..., 2) of points (..., 3) in the real image; NaN for points that are not in front of the camera."""
         points = self.bent(points_in_cam.reshape(-1, 3)).reshape(points_in_cam.shape)
         return self.camera.without_distortion().project(points)
+
+    def leave_out(self, is_left_out: NDArray[np.bool_]) -> None:
+        """Leave some components (C,) out of the views that follow: they hide nothing, either."""
+        faces, winding, component_of_face = self._all_faces
+        kept = ~is_left_out[component_of_face]
+        self._faces, self._winding, self._component_of_face = faces[kept], winding[kept], component_of_face[kept]
 
     def view(self, cam_from_model: Array) -> GhostView | None:
         """Render the model at a pose (4,4); None if the part is outside the image."""

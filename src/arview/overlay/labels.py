@@ -17,7 +17,7 @@ import numpy as np
 from arview.core.messages import Message, sentence
 from arview.geometry import Array, apply
 from arview.inspection import ComponentDeviation, Finding, Inspection, Verdict, decimals_of
-from arview.overlay.evidence import DISPLACED_RGB, MISSING_RGB, DrawnEvidence, dimmed, evidence_of
+from arview.overlay.evidence import DISPLACED_RGB, MISSING_RGB, NEXT_RGB, DrawnEvidence, dimmed, evidence_of
 from arview.overlay.options import DECIMALS, NEUTRAL_RGB, UNIT, VERDICT_RGB, VERDICT_WORD, OverlayOptions, Rgb
 from arview.pose import ComponentPresence
 
@@ -171,13 +171,19 @@ class LabelText:
             return MISSING_RGB
         if self.evidence is DrawnEvidence.DISPLACED:
             return DISPLACED_RGB
+        if self.evidence.is_awaited or self.evidence is DrawnEvidence.WRONG:
+            return NEXT_RGB if self.evidence.is_awaited else MISSING_RGB
         color = NEUTRAL_RGB if self.verdict is None else VERDICT_RGB[self.verdict]
         return dimmed(color) if self.is_dimmed else color
 
     @cached_property
     def is_urgent(self) -> bool:
-        """Whether the component must be shown by its label or an arrow: failed, undecided, missing or displaced."""
-        return self.evidence.is_refuted or self.verdict in (Verdict.FAIL, Verdict.UNDECIDED)
+        """Whether the component must be shown by its label or an arrow: refuted, next, failed or undecided."""
+        return (
+            self.evidence.is_refuted
+            or self.evidence is DrawnEvidence.NEXT
+            or self.verdict in (Verdict.FAIL, Verdict.UNDECIDED)
+        )
 
 
 def age_text(age_s: float) -> Message:
@@ -236,6 +242,9 @@ def label_text(
     evidence = evidence_of(presence, is_withheld)
     if evidence is DrawnEvidence.WITHHELD:
         return LabelText(name, "", sentence("label.withheld"), evidence=evidence, is_dimmed=True)
+    if evidence.is_awaited or evidence is DrawnEvidence.WRONG:
+        word = "" if evidence is DrawnEvidence.LATER else sentence(f"label.{evidence}")
+        return LabelText(name, "", word, _with((), note), evidence=evidence)
     changed = sentence("label.changed")
     was_missing = deviation is not None and deviation.finding is Finding.MISSING
     was_measured = deviation is not None and deviation.distance_mm is not None
@@ -318,12 +327,16 @@ def text_urgency(
     evidence: Mapping[str, DrawnEvidence],
     pending: Collection[str] = (),
 ) -> list[str]:
-    """Components that deserve a label, the most urgent first: missing or displaced ones, then by `label_order`."""
+    """Components that deserve a label, the most urgent first: missing or displaced ones, those to be mounted
+    now, then by `label_order`.
+    """
     measured = label_order(names, inspection, pending)
     refuted = [name for name in names if evidence[name].is_refuted]
     rank = {name: index for index, name in enumerate(measured)}
     refuted.sort(key=lambda name: (evidence[name] is DrawnEvidence.DISPLACED, rank.get(name, len(rank)), name))
-    return [*refuted, *(name for name in measured if name in evidence and not evidence[name].is_refuted)]
+    shown = [*refuted, *(name for name in names if evidence[name] is DrawnEvidence.NEXT)]
+    hidden = {*shown, *(name for name in names if evidence[name] is DrawnEvidence.LATER)}
+    return [*shown, *(name for name in measured if name in evidence and name not in hidden)]
 
 
 def text_size_px(image_height: int) -> int:

@@ -9,7 +9,7 @@ import numpy as np
 
 from arview.core.messages import sentence
 from arview.overlay import paint
-from arview.overlay.evidence import DIMMED_RGB, DISPLACED_RGB, MISSING_RGB, DrawnEvidence
+from arview.overlay.evidence import DIMMED_RGB, DISPLACED_RGB, MISSING_RGB, NEXT_RGB, DrawnEvidence
 from arview.overlay.options import CONTEXT_RGB, Rgb
 from arview.pose import Pose
 
@@ -18,6 +18,8 @@ _AMBER: Rgb = (255, 176, 32)
 _ENTRIES: dict[DrawnEvidence, str] = {
     DrawnEvidence.MISSING: sentence("legend.missing"),
     DrawnEvidence.DISPLACED: sentence("legend.displaced"),
+    DrawnEvidence.WRONG: sentence("legend.wrong"),
+    DrawnEvidence.NEXT: sentence("legend.next"),
     DrawnEvidence.UNVERIFIED: sentence("label.not_verified"),
     DrawnEvidence.UNCERTAIN: sentence("label.not_verified"),
     DrawnEvidence.WITHHELD: sentence("legend.withheld"),
@@ -84,6 +86,10 @@ def _draw_swatch(sprite: paint.Sprite, kind: DrawnEvidence, x: int, y: int, widt
         on = left | (u >= width - third) | ((v == height // 2) & (u >= third))
     elif kind is DrawnEvidence.WITHHELD:
         color, on = CONTEXT_RGB, rim
+    elif kind is DrawnEvidence.WRONG:
+        color, on = MISSING_RGB, ((u + v) % period < (period + 1) // 2) | rim
+    elif kind is DrawnEvidence.NEXT:
+        color, on = NEXT_RGB, rim | (v > 0)
     else:
         on = rim & dash
     mask = np.where(on, 255, 0).astype(np.uint8)

@@ -165,11 +165,13 @@ class PartLayers:
             now: time from which the age of the inspection is computed; None: the current time.
             frame: the picture without anything drawn on it; None: the canvas is.
         """
+        shows, count = self.options.show_evidence, len(self._names)
+        presences = [presence_of(pose, name, count) if shows else None for name in self._names]
+        if pose.steps is not None:
+            self._ghost.leave_out(np.array([evidence_of(one) is DrawnEvidence.LATER for one in presences]))
         view = self._ghost.view(pose.cam_from_model) if pose.cam_from_model is not None else None
         self._drawn = None
         if view is not None:
-            shows, count = self.options.show_evidence, len(self._names)
-            presences = [presence_of(pose, name, count) if shows else None for name in self._names]
             scene = self._scene_of(pose, presences, now)
             self._drawn = _PartInPicture(view, presences, scene)
             occluder = self._find_occluder(canvas if frame is None else frame, view, pose, scene)
@@ -214,11 +216,13 @@ class PartLayers:
     def draw_state(
         self, canvas: paint.Image, pose: Pose, fps: float | None = None, now: datetime | None = None
     ) -> None:
-        """Draw the status line, why labels are withheld, and the outline of the guide pose."""
+        """Draw the status line, why labels are withheld or what is wrong, and the outline of the guide pose."""
         if pose.cam_from_model is None and pose.guide_cam_from_model is not None:
             self._guide.draw(canvas, pose.guide_cam_from_model)
         if pose.is_label_withheld and self.options.show_evidence:
-            self._draw_banner(canvas, pose)
+            self._draw_banner(canvas, withheld_title(pose), pose.identity_reason)
+        elif pose.steps is not None and pose.steps.faults:
+            self._draw_banner(canvas, pose.steps.faults[0], "; ".join(pose.steps.faults[1:]))
         if self.options.show_status:
             self._status.draw(canvas, pose, fps, now)
 
@@ -276,7 +280,7 @@ class PartLayers:
         dimming = np.ones((len(scene.evidence), 4), dtype=np.float32)
         if is_critical:
             # What was seen to be missing or displaced is shown in full, because it may be why the pose is critical.
-            dimming[[not seen.is_refuted for seen in scene.evidence], 3] = _CRITICAL_DIMMING
+            dimming[[not (seen.is_refuted or seen.is_awaited) for seen in scene.evidence], 3] = _CRITICAL_DIMMING
         blend(
             canvas,
             view.u0,
@@ -346,7 +350,7 @@ class PartLayers:
         if self._occluders is None or pose.cam_from_model is None:
             return None
         learns = pose.state is TrackingState.TRACKED and pose.quality >= _LEARNING_QUALITY
-        absent = np.array([seen.is_refuted for seen in scene.evidence])
+        absent = np.array([seen.is_refuted or seen.is_awaited for seen in scene.evidence])
         return self._occluders.find(canvas, view, pose.cam_from_model, learns, absent)
 
     def _open_notes(self, pose: Pose) -> dict[int, str]:
@@ -360,10 +364,10 @@ class PartLayers:
         note = sentence("label.one_of_two") if count == 2 else sentence("label.one_of", count=count)
         return {int(index): note for index in np.flatnonzero(apart)}
 
-    def _draw_banner(self, canvas: paint.Image, pose: Pose) -> None:
+    def _draw_banner(self, canvas: paint.Image, title: str, text: str) -> None:
         margin = round(0.6 * self._size_px)
         width_px = self.camera.width - 2 * margin
-        sprite = banner_sprite(withheld_title(pose), pose.identity_reason, self._size_px, width_px)
+        sprite = banner_sprite(title, text, self._size_px, width_px)
         paint.put_sprite(canvas, sprite, (self.camera.width - sprite.width) // 2, margin)
 
     def _arrows_in_model(self, evidence: list[DrawnEvidence]) -> Array:

@@ -137,7 +137,9 @@ class StatusLine:
             items.append((f"quality {pose.quality:.2f}", _WHITE))
         if fps is not None:
             items.append((f"{fps:.0f} fps", _WHITE))
-        if self._with_completeness and pose.cam_from_model is not None:
+        if pose.steps is not None:
+            items.append((pose.steps.text, _WHITE))
+        elif self._with_completeness and pose.cam_from_model is not None:
             items.append((completeness_text(pose), _COMPLETENESS_RGB[pose.completeness]))
         if not pose.remark:
             return items

@@ -15,7 +15,7 @@ import time
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.assembly import AssemblyMonitor, Turn
+from arview.assembly import AssemblyMonitor
 from arview.cad import Model
 from arview.camera import Camera, FrameView
 from arview.core.checks import check_type
@@ -196,13 +196,13 @@ class SpecimenTracking:
             InputError: an image of another size or type.
         """
         started = time.perf_counter()
-        image = self.frames.picture(image, index)
+        image, steps = self.frames.picture(image, index), self.components.steps
         self.search.others, self.search.covers = others, covers
         self.search.prior = None if prior is None else prior.cam_from_model
         estimate, reason = self._follow(image) if self._state.has_pose else self._search(image)
         if estimate is not None:
             estimate, reason = self._disambiguate(image, estimate, reason)
-            reason = self._check_components(image, estimate, reason)
+            reason = self._check_components(image, estimate, reason, time_s)
             self._remember(estimate)
         known = self.identity.update(image, estimate, index, time_s, others, self._state.is_confirmed)
         if known.cam_from_model is not None and estimate is not None:
@@ -221,6 +221,7 @@ class SpecimenTracking:
                 ms=ms,
                 reason=reason,
                 guide_cam_from_model=self.search.guide_pose(self._state),
+                steps=None if steps is None else steps.report,
             )
         pose, covariance = estimate.cam_from_model, self.tracker.covariance(estimate)
         quality = self._quality(estimate, covariance)
@@ -248,6 +249,7 @@ class SpecimenTracking:
             identity_reason=known.reason,
             serial=known.serial,
             components=self.components.presence(pose, bool(self._state.hypotheses)),
+            steps=None if steps is None else steps.report,
         )
 
     def _quality(self, estimate: Estimate, covariance: Array) -> float:
@@ -351,7 +353,7 @@ class SpecimenTracking:
         return estimate
 
     def _restart(
-        self, image: NDArray[np.uint8], cam_from_model: Array, turn: Turn | None = None, rests_on_base: bool = False
+        self, image: NDArray[np.uint8], cam_from_model: Array, is_turned: bool = False, rests_on_base: bool = False
     ) -> Estimate:
         """Track from a pose on; nothing is known of the components yet, unless it is the pose so far, turned.
 
@@ -361,10 +363,10 @@ class SpecimenTracking:
             lines = self.components.lines(self._part, cam_from_model, self.search.base_part, is_base_only=True)
             self.tracker.expect(lines)
         self.tracker.start(image, cam_from_model)
-        if turn is None:
-            self.components.reset(is_placed=not rests_on_base)
+        if is_turned:
+            self.components.turn()
         else:
-            self.components.turn(turn)
+            self.components.reset(is_placed=not rests_on_base)
         return self.tracker.track(image)
 
     # --- Examine a pose -----------------------------------------------------------------------------------
@@ -377,7 +379,7 @@ class SpecimenTracking:
         if self.components.rests_on_base:
             estimate = self._recheck_whole(image, estimate)
         if (turn := self.components.better_turn) is not None:
-            return self._restart(image, estimate.cam_from_model @ turn.model_from_model, turn), reason
+            return self._restart(image, estimate.cam_from_model @ turn.model_from_model, is_turned=True), reason
         pose = estimate.cam_from_model
         if self._turns.is_due():
             colors, covariance = self.tracker.state.appearance.colors, self.tracker.covariance(estimate)
@@ -439,11 +441,11 @@ class SpecimenTracking:
             self.components.is_placed = True
         return is_same
 
-    def _check_components(self, image: NDArray[np.uint8], estimate: Estimate, reason: str) -> str:
+    def _check_components(self, image: NDArray[np.uint8], estimate: Estimate, reason: str, time_s: float) -> str:
         """Check that the components are where the CAD has them; a part with a wrong one is never ``tracked``."""
         s = self._state
         s.is_supported = s.state == TrackingState.TRACKED
-        self.components.update(image, estimate.cam_from_model, estimate.quality, s.is_supported)
+        self.components.update(image, estimate.cam_from_model, estimate.quality, s.is_supported, time_s)
         pose, base_part = estimate.cam_from_model, self.search.base_part
         self.tracker.expect(self.components.lines(self._part, pose, base_part))
         reasons = [text for text in (reason, *self.components.mismatches) if text]

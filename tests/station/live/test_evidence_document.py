@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 
 from arview.cad import load_part
+from arview.core.messages import sentence, with_messages
 from arview.geometry import rigid
 from arview.inspection import load_inspection
 from arview.overlay import OverlayOptions
-from arview.pose import ComponentPresence, Identity, Pose, Presence, TrackingState, Visibility
-from arview.station.live.stream.documents import evidence_document
+from arview.pose import ComponentPresence, Identity, Pose, Presence, StepReport, TrackingState, Visibility
+from arview.station.live.stream.documents import _part_pose_document, evidence_document
 from helpers.live_sample import INSPECTION, PART
 
 MOVED = rigid(np.eye(3), [0.0, 35.0, 0.0])
@@ -87,3 +88,25 @@ def test_each_label_says_that_the_inspection_is_of_another_serial(subject: Any) 
     assert len(labels) == len(subject.inspection.components)
     for one in labels:
         assert one["is_dimmed"] and one["notes"] == [f"measured on {subject.inspection.serial}, not on this one"]
+
+
+def test_steps_of_an_assembly(subject: Any) -> None:
+    assert _part_pose_document(posed(subject), subject)["steps"] is None
+    fault = sentence("steps.wrong_order", name="nut_1", others="post_1")
+    steps = StepReport(
+        ("post_1", "nut_1"),
+        (("post_1",), ("nut_1",)),
+        (True, False),
+        (0.0, None),
+        (None, None),
+        (fault,),
+        ((fault, 1.0, None),),
+    )
+    pose = posed(subject, post_1=seen(Presence.NEXT), nut_1=seen(Presence.LATER))
+    document = with_messages(_part_pose_document(replace(pose, steps=steps), subject))
+    json.dumps(document, allow_nan=False)
+    assert document["steps"]["text"] == "1/2 mount post_1" and document["steps"]["faults"] == [fault]
+    assert [row.get("state") for row in document["steps"]["rows"]] == ["current", "locked", None]
+    assert {"1/2 mount post_1", fault, "NEXT"} <= document["messages"].keys()
+    labels = {one["evidence"]: one["word"] for one in document["labels"]}
+    assert labels == {"next": "NEXT", "later": ""}

@@ -156,10 +156,15 @@ Pose::
      "mismatches": [words], "unverified": [components not seen yet], "ambiguous": how many other poses fit as well,
      "completeness": "COMPLETE", "INCOMPLETE: 1 missing", "NOT YET CHECKED" or empty,
      "withheld": {"title", "text"} | null,     of another specimen: nothing that was measured is shown
+     "steps": {"text": what is to be done now, "faults": [texts], "rows": [{"step": number from 1, "name",
+               "components": [names], "state": "done" | "current" | "locked", "started_s", "done_s": time
+               stamp of a frame | null}, …, {"fault": text, "kind", "began_s", "ended_s"}, …]}
+               | null,     of a part with [[steps]]
      "identity": "followed" | "confirmed" | "unconfirmed" | "other",   is it the part that was followed, see Identity
      "serial": read from a code on the part, or empty,
      "legend": [{"kind": evidence, "text"}],   kinds of evidence that need an explanation
-     "labels": [{"index": of the component, "evidence": "seen" | "unverified" | "uncertain" | "missing" | "displaced",
+     "labels": [{"index": of the component, "evidence": "seen" | "unverified" | "uncertain" | "missing" | "displaced" |
+                     "next" | "later" (not to be drawn) | "wrong",      the last three of a part with steps
                  "value", "word": on the label instead of the verdict, "notes": [texts], "color": "#rrggbb",
                  "is_dimmed": measured, but not seen so here, "is_urgent": bool,
                  "model_from_nominal": [16] | null}],     only of components that differ from *Part*

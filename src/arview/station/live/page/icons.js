@@ -11,6 +11,8 @@ const PATHS = {
     '<path d="M7.5 7.5l9 9M16.5 7.5l-9 9"/></g>',
   displaced: '<rect x="2" y="2" width="9" height="9" fill="none" stroke="currentColor" stroke-width="2.4" stroke-dasharray="3 2.4"/>' +
     '<path d="M13 13h9v9h-9z"/><path d="M7 7l7 7" fill="none" stroke="currentColor" stroke-width="2.4"/>',
+  next: '<path d="M12 2v12M6 9l6 6 6-6M3 21h18" fill="none" stroke="currentColor" stroke-width="2.8"/>',
+  wrong: '<path d="M2 2h20v20H2z" fill="none" stroke="currentColor" stroke-width="2.6"/><path d="M7.5 7.5l9 9M16.5 7.5l-9 9" fill="none" stroke="currentColor" stroke-width="2.6"/>',
   none: '<circle cx="12" cy="12" r="4"/>',
   tracked: '<circle cx="12" cy="12" r="10"/><path class="ink" d="M7 12.5l3.4 3.4L17 9"/>',
   critical: '<path d="M12 1.8L23 21.5H1z"/><path class="ink" d="M12 8.5v6M12 17.9v.1"/>',

@@ -143,7 +143,7 @@ class PartList {
     const seen = this.seen.get(one.name);
     const plain = { kind: one.verdict ?? "none", value: one.is_pending ? t("parts.measuring") : one.value_text || (one.missing ? t("parts.missing") : "–"), u: one.uncertainty_mm, word: one.verdict ? t(`verdict.${one.verdict}`) : one.verdict_text ?? (one.is_pending ? "" : t("parts.no_verdict")), notes: [] };
     if (!seen || (one.verdict === null && seen.is_dimmed)) return plain;
-    if (!["missing", "displaced"].includes(seen.evidence)) return { ...plain, kind: `${plain.kind}${seen.is_dimmed ? " dimmed" : ""}`, notes: seen.notes };
+    if (!["missing", "displaced", "wrong", "next"].includes(seen.evidence)) return { ...plain, kind: `${plain.kind}${seen.is_dimmed ? " dimmed" : ""}`, notes: seen.notes };
     return { kind: seen.evidence, value: one.is_pending && seen.evidence === "missing" ? "" : seen.value, u: null, word: seen.word, notes: seen.notes };
   }
 
@@ -197,6 +197,7 @@ class PartList {
       forward, button("close", t("card.all"), () => this.onPick(null)),
     ]);
     if (this.withheld) return [head, make("p", "rest", [this.withheld.text])];
+    if (["wrong", "next"].includes(kind)) return [head, make("p", "big", [word]), ...remark];
     if (["missing", "displaced"].includes(kind)) return [head, make("p", "big", [value || t("parts.missing")]), ...remark];
     if (one.distance_mm === null) {
       return [head, make("p", "big", [one.is_pending ? t("parts.measuring") : one.value_text || t(one.verdict ? "card.not_measured" : "card.not_inspected")])];

@@ -6,11 +6,11 @@ import { hasText, t } from "./texts/texts.js";
 
 const SEVERITY = ["tracked", "critical", "searching", "lost"];
 
-/** What a pose says of a part in one line: incomplete, withheld, the reason of its state, mismatches. */
-export function reasonOf({ state, remark, completeness, withheld, mismatches }) {
+/** What a pose says of a part in one line: faults and the step to be done, incomplete, withheld, the reason of its state, mismatches. */
+export function reasonOf({ state, remark, completeness, withheld, mismatches, steps = null }) {
   const reason = remark || (hasText(`why.${state}`) ? t(`why.${state}`) : "");
   const found = completeness.startsWith("INCOMPLETE") ? [t("why.incomplete")] : [];
-  return [...found, ...(withheld ? [`${withheld.title}: ${withheld.text}`] : []), ...(reason ? [reason] : []), ...mismatches].join("; ");
+  return [...(steps ? [...steps.faults, steps.text] : []), ...found, ...(withheld ? [`${withheld.title}: ${withheld.text}`] : []), ...(reason ? [reason] : []), ...mismatches].join("; ");
 }
 
 /** State and reason of several parts together: tracked if all are, else the most severe, with how many are tracked. */

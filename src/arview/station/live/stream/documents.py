@@ -45,7 +45,7 @@ def _list_of_several(parts: list[Document]) -> Document:
 
 def _part_pose_document(pose: Pose, subject: Subject | None) -> Document:
     """What *Pose* says of one part."""
-    guide = pose.guide_cam_from_model
+    guide, steps = pose.guide_cam_from_model, pose.steps
     return {
         "state": str(pose.state),
         "quality": round(pose.quality, 3),
@@ -54,6 +54,7 @@ def _part_pose_document(pose: Pose, subject: Subject | None) -> Document:
         "mismatches": list(pose.mismatches),
         "unverified": list(pose.unverified),
         **evidence_document(pose, subject),
+        "steps": steps and {"text": steps.text, "faults": list(steps.faults), "rows": steps.rows()},
         "identity": str(pose.identity),
         "serial": pose.serial,
         "ambiguous": len(pose.alternatives),

@@ -131,7 +131,8 @@ class Recorder:
         self._sink.write(_fitted(image, *self._size), tracked.arrived_s)
         self._camera = tracked.camera
         for pose in tracked.poses:
-            self._poses.write(replace(pose, index=self._frames, time_s=tracked.arrived_s - self._first_s))
+            steps, time_s = pose.steps and pose.steps.since(self._first_s), tracked.arrived_s - self._first_s
+            self._poses.write(replace(pose, index=self._frames, time_s=time_s, steps=steps), image=tracked.frame.image)
         self._frames += 1
 
     def _may_continue(self) -> bool:

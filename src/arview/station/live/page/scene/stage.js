@@ -16,7 +16,8 @@ const PASS_DIMMING = 0.65; // ghosts of components that passed are fainter, so t
 const NEUTRAL = "#46c4ff", CONTEXT = "#e2e8f0", CONTEXT_ALPHA = 0.5;
 const HATCH_ALPHA = 0.75; // the lines of a hatched ghost cover little
 const DIMMED = 0.45; // factor of the opacity of ghosts that the pictures do not verify
-const PATTERNS = { missing: 2, displaced: 1 };
+const PATTERNS = { missing: 2, displaced: 1, wrong: 1 };
+const NEXT_ALPHA = 0.6; // ghost of a component that is to be mounted now
 const COVERED = 0.55; // with less of the stage free than this share, the picture avoids all that covers it
 const ROOMY = 0.8; // the picture avoids the bars if it keeps this fraction of its size
 const MARGIN_PX = 8;
@@ -202,13 +203,14 @@ export class Stage {
       const color = rgb(isContext ? CONTEXT : seen?.color ?? one.verdict_color ?? tag_color ?? NEUTRAL);
       let alpha = isOnly || one.verdict !== "pass" ? opacity : opacity * PASS_DIMMING;
       if (pattern) alpha = HATCH_ALPHA;
+      else if (seen?.evidence === "next") alpha = NEXT_ALPHA;
       else if (seen?.is_dimmed) alpha *= DIMMED;
       if (!ghost || withheld || (isContext && !isOnly)) alpha = 0;
       const edgeAlpha = edges === "none" ? 0 : isContext && !withheld ? CONTEXT_ALPHA : 1;
       return {
         ghost: [...color, alpha],
         edges: [...color.map((value) => 0.75 * value + 0.25), edgeAlpha],
-        isShown: !only || isOnly,
+        isShown: seen?.evidence !== "later" && (!only || isOnly),
         pattern: withheld ? 0 : pattern,
         isDashed: !withheld && ["unverified", "uncertain", "displaced"].includes(seen?.evidence),
         place: withheld ? null : seen?.model_from_nominal ?? null,

@@ -41,7 +41,7 @@ function inWords(value) {
 }
 
 const NUMBER = /^[-−+≈]? ?\d+\.\d+( ± \d+\.\d+)?( mm)?$/; // a value that is a number, not a name
-const SAID = new Set(["text", "reason", "remark", "title", "value", "word", "notes", "value_text", "mismatches", "lacking", "steps", "place", "how", "note"]);
+const SAID = new Set(["text", "reason", "remark", "title", "value", "word", "notes", "value_text", "mismatches", "faults", "lacking", "steps", "place", "how", "note"]);
 const NUMBERS = new Set(["value", "value_text", "detail_text"]); // texts of numbers, beside words in the language
 const OF_PEOPLE = new Set(["decisions", "signed", "record", "messages"]); // what people wrote stays as it is
 
