@@ -9,13 +9,28 @@ from typing import TYPE_CHECKING
 
 import click
 
-from arview.cli.common import RESOURCES, SCHEDULER, main, say
+from arview.cli.common import main, say
 from arview.cli.exit_codes import ExitCode, exit_code_of
 from arview.quality import batch as quality
 from arview.quality import history
 
 if TYPE_CHECKING:
     pass
+
+
+def _parse_resources(ctx: click.Context, parameter: click.Parameter, value: str | None) -> dict[str, float]:
+    """``{"GPU": 1.0}`` of GPU=1."""
+    try:
+        pairs = [one.split("=") for one in value.split(",")] if value else []
+        return {name.strip(): float(amount) for name, amount in pairs}
+    except ValueError:
+        raise click.BadParameter(f"{value!r}: expected names and amounts like GPU=1,MEMORY=4e9") from None
+
+
+SCHEDULER = click.option("--scheduler", metavar="URL", help="tcp://host:port of a Dask scheduler; default: none.")
+RESOURCES = click.option(
+    "--resources", callback=_parse_resources, metavar="NAME=N", help="What its workers must have, e.g. GPU=1."
+)
 
 
 @main.command(

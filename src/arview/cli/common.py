@@ -284,22 +284,6 @@ def _parse_modalities(ctx: click.Context, parameter: click.Parameter, value: str
     return names
 
 
-def _parse_resources(ctx: click.Context, parameter: click.Parameter, value: str | None) -> dict[str, float]:
-    """``{"GPU": 1.0}`` of GPU=1."""
-    found: dict[str, float] = {}
-    for one in (value or "").split(",") if value else ():
-        name, _, amount = one.partition("=")
-        try:
-            found[name.strip()] = float(amount)
-        except ValueError:
-            raise click.BadParameter(f"{value!r}: expected names and amounts like GPU=1,MEMORY=4e9") from None
-    return found
-
-
-SCHEDULER = click.option("--scheduler", metavar="URL", help="tcp://host:port of a Dask scheduler; default: none.")
-RESOURCES = click.option(
-    "--resources", callback=_parse_resources, metavar="NAME=N", help="What its workers must have, e.g. GPU=1."
-)
 UNIT = click.option("--unit", type=click.Choice(["mm", "cm", "m", "inch"]), help="Unit of the numbers in the CAD file.")
 RENDERER = click.option(
     "--renderer",

@@ -16,10 +16,9 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from arview import guideviews
+from arview.cli.batch import RESOURCES, SCHEDULER
 from arview.cli.common import (
     RENDERER,
-    RESOURCES,
-    SCHEDULER,
     UNIT,
     check_profile,
     inspection_file,
@@ -98,6 +97,16 @@ def _revoke_devices(names: tuple[str, ...]) -> None:
             known = ", ".join(one.name for one in devices.listed()) or "none"
             raise InputError(f"--revoke {name}: there is no device of that name; paired are: {known}")
         say(f"{name} is no longer paired")
+
+
+def _job_options(
+    folder: str, archive_days: float | None, scheduler: str | None, resources: dict[str, float]
+) -> station.JobOptions:
+    """Options of the inspections; a cluster gets more of them at once than this machine."""
+    at_once = CLUSTER_JOBS if scheduler else 1
+    return station.JobOptions(
+        folder=Path(folder), archive_days=archive_days, workers=at_once, scheduler=scheduler, resources=resources
+    )
 
 
 @main.command(
@@ -272,13 +281,7 @@ def live(
         record=video,
         record_folder=video.parent if video else Path(),
         recording=station.RecordingOptions(quota_bytes=round(1e9 * quota)),
-        jobs=station.JobOptions(
-            folder=Path(jobs),
-            archive_days=archive,
-            workers=CLUSTER_JOBS if scheduler else 1,
-            scheduler=scheduler,
-            resources=resources,
-        ),
+        jobs=_job_options(jobs, archive, scheduler, resources),
         width=size[0],
         height=size[1],
         fps=fps,

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from arview import reconstruction
 from arview.cad import Model, Part
 from arview.camera import Camera
 from arview.core.extras import require
@@ -95,9 +96,7 @@ def read_folder(folder: str | Path, photos: str | Path | None = None, with_cloud
         raise InputError(f"{folder}: the sparse model holds none of the photos; reconstruct again")
     cloud = None
     if has_cloud:
-        from arview.reconstruction import read_ply
-
-        cloud = read_ply(folder / "cloud.ply")
+        cloud = reconstruction.read_ply(folder / "cloud.ply")
     frame = np.eye(4) if scale.model_from_scan is None else scale.model_from_scan
     sparse = sparse if scale.scale is None else sparse.transformed(scale.scale, frame)
     return MetricReconstruction(sparse, scale, cloud)
@@ -146,12 +145,10 @@ def read_cloud(
 
 def _own_ply(path: Path) -> DenseCloud | None:
     """The cloud of a PLY file that arview wrote, which is in mm, else None."""
-    from arview.reconstruction import read_ply
-
     try:
         with path.open("rb") as file:
             is_own = b"property float sigma_mm" in file.read(1024)
-        return read_ply(path) if is_own else None
+        return reconstruction.read_ply(path) if is_own else None
     except (OSError, InputError):
         return None
 

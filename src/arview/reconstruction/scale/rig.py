@@ -18,7 +18,7 @@ from arview.cad import Part
 from arview.camera import Camera
 from arview.core.fits import robust_sigma, tukey_weights
 from arview.errors import InputError
-from arview.geometry import Array, apply, exp_se3, invert, log_se3, orthonormalise, rigid, skew
+from arview.geometry import Array, apply, exp_se3, invert, log_se3, orthonormalise, rigid
 from arview.guideviews import GuideViewOptions, cached_guide_views
 from arview.reconstruction.intake.reading import read_photo
 from arview.reconstruction.scale.cad import (
@@ -298,7 +298,7 @@ def _adjoint(cam_from_model: Array, center: Array) -> Array:
     rotation, shift = cam_from_model[:3, :3], apply(cam_from_model, center)
     result = np.zeros((6, 6))
     result[:3, :3] = result[3:, 3:] = rotation
-    result[3:, :3] = skew(shift) @ rotation
+    result[3:, :3] = np.cross(shift, rotation, axisb=0, axisc=0)
     return result
 
 

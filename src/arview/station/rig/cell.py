@@ -7,7 +7,6 @@ import time
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import cv2
 
@@ -21,9 +20,6 @@ from arview.pose import ComponentPresence, Pose, Presence, TrackingState, Visibi
 from arview.station.rig.cameras import RigCameras
 from arview.station.rig.station_file import Station
 from arview.workflow.new_inspection import new_inspection
-
-if TYPE_CHECKING:
-    from arview.calibration import CameraRig
 
 METHODS: tuple[measurement.Method, ...] = ("edges",)
 """How components are measured: few cameras give the edges more than the surfaces, which need texture."""
@@ -62,7 +58,7 @@ class Cell:
 
     def __init__(self, station: Station) -> None:
         self.station = station
-        self.rig: CameraRig = calibration.CameraRig.load(station.rig_path)
+        self.rig = calibration.CameraRig.load(station.rig_path)
         names = tuple(one.name for one in station.cameras)
         if set(self.rig.names) != set(names):
             raise InputError(
