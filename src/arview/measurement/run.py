@@ -70,6 +70,7 @@ def measure(
     *,
     progress: Progress | None = None,
     known: dict[str, MethodResults] | None = None,
+    starts: Mapping[str, Array] | None = None,
 ) -> Inspection:
     """Measure every inspected component in the datum frame, with its uncertainty and verdict.
 
@@ -80,6 +81,7 @@ def measure(
         progress: called with (what, done, total).
         known: what the methods by photos found of each component in the same reconstruction; an empty one is filled, so
             that a measurement with the cloud need not repeat it.
+        starts: (4,4) measured_from_nominal of components that are known within two pixels, by name.
 
     Raises:
         InputError: the reconstruction contradicts the CAD, a datum is not covered, or there is nothing to inspect.
@@ -92,7 +94,9 @@ def measure(
     # One thread for BLAS: work is parallel over components, and the matrices have only some hundred rows.
     with threadpool_limits(1, "blas"):
         tell = progress or (lambda what, done, total: None)
-        return _measure(reconstruction, part, options or MeasureOptions(), tell, {} if known is None else known)
+        return _measure(
+            reconstruction, part, options or MeasureOptions(), tell, {} if known is None else known, starts or {}
+        )
 
 
 def _measure(
@@ -101,6 +105,7 @@ def _measure(
     options: MeasureOptions,
     tell: Progress,
     known: dict[str, MethodResults],
+    starts: Mapping[str, Array],
 ) -> Inspection:
     """The steps of `measure`, on the rough frame of the reconstruction."""
     began, warnings = time.process_time(), list(reconstruction.scale.warnings)
@@ -123,7 +128,7 @@ def _measure(
     if not has_photos and "cloud" not in options.methods:
         raise InputError("a cloud without photos can only be measured by the method 'cloud'")
     views = load_views(replace(reconstruction.sparse, pose_covariance=None), part.model) if has_photos else None
-    results = measure_all(reconstruction, views, part, [*base, *names], options, tell, known)
+    results = measure_all(reconstruction, views, part, [*base, *names], options, tell, known, starts)
     tell("datums", 0, 1)
     alignment, failed = align_to_datums(reconstruction, views, part, base, results)
     warnings += [*(failed_datum_text(one) for one in failed), *datum_doubts(alignment)]
@@ -178,8 +183,9 @@ def measure_all(
     options: MeasureOptions,
     tell: Progress,
     known: dict[str, MethodResults],
+    starts: Mapping[str, Array] | None = None,
 ) -> dict[str, ComponentMeasurement]:
-    """Measure every component by every requested method, in the rough frame; for ``known`` see `measure`."""
+    """Measure every component by every requested method, in the rough frame; for the last two see `measure`."""
     found: dict[str, list[Move | NotMeasured]] = {name: [] for name in names}
     if views is not None and {"sweep", "edges"} & set(options.methods):
 
@@ -187,7 +193,11 @@ def measure_all(
             tell("components", round(share * len(names)), len(names))
 
         if not known:
-            known.update(measure_components_in_photos(views, part, part.model, step, names, options.methods))
+            known.update(
+                measure_components_in_photos(
+                    views, part, part.model, step, names=names, methods=options.methods, starts=starts
+                )
+            )
         for name, by_method in known.items():
             found[name] += [by_method[method] for method in options.methods if method in by_method]
     if "cloud" in options.methods and reconstruction.cloud is not None:

@@ -213,8 +213,13 @@ class ComponentEdges:
         self._predicted: tuple[Array, EdgePoints, Array] | None = None
         self._clear = (0.0, 0.0)
 
-    def measure(self, start: Array | None = None) -> Move | NotMeasured:
-        """Measure the component's move; ``start`` (4,4) is its approximate place, None searches around nominal."""
+    def measure(self, start: Array | None = None, is_near: bool = False) -> Move | NotMeasured:
+        """Measure the component's move.
+
+        Args:
+            start: (4,4) its approximate place; None searches around nominal.
+            is_near: the start is right within two pixels.
+        """
         place = np.eye(4) if start is None else start
         flanked = self._choose_clear(place)
         edges = self.predicted(place, self._clear[0])
@@ -228,6 +233,7 @@ class ComponentEdges:
         # Start on reduced pictures where a pixel is much smaller than the displacements searched for.
         levels = [k for k in (2, 1) if self.body.px_mm * 2.0**k < 0.6]
         rounds = [(k, 6.0) for k in levels] + [(0, reach) for reach in REACHES_PX]
+        rounds = rounds[-FINE_ROUNDS:] if is_near else rounds
         if start is None:
             place = self._capture(edges, levels[0] if levels else 0)
         dark_mm = 0.0

@@ -8,6 +8,7 @@ import numpy as np
 
 from arview.cad import Model, Part, Samples, sample_surface
 from arview.core.parallel import pool
+from arview.geometry import Array
 from arview.measurement.photo.component import MeasuredComponent
 from arview.measurement.photo.edges import ComponentEdges
 from arview.measurement.photo.patches import near_others
@@ -48,6 +49,7 @@ def measure_components_in_photos(
     progress: Callable[[str, float], None] | None = None,
     names: Sequence[str] | None = None,
     methods: Sequence[Method] = ("sweep", "edges"),
+    starts: Mapping[str, Array] | None = None,
 ) -> dict[str, MethodResults]:
     """Measure where components are, by each of the two methods.
 
@@ -61,6 +63,7 @@ def measure_components_in_photos(
         progress: called with the name of a finished component and the share that is done.
         names: components to measure; default: those inspected.
         methods: without "sweep", only what the edges do not find is also measured by its surface.
+        starts: (4,4) places of components that are known within two pixels, by name.
 
     Raises:
         InputError: there are fewer than three photos, photos cannot be read, a component does not exist, or the poses
@@ -72,8 +75,11 @@ def measure_components_in_photos(
         names = [component.name for component in model.components if part is None]
         names = names or [name for name in part.inspected if name in known] if part is not None else names
     indices = [model.index(name) for name in names]
+    near = {model.index(name): place for name, place in (starts or {}).items()}
     results: dict[str, MethodResults] = {}
-    jobs = [(index, pool().submit(measure_component, views, index, part, methods)) for index in indices]
+    jobs = [
+        (index, pool().submit(measure_component, views, index, part, methods, near.get(index))) for index in indices
+    ]
     for done, (index, job) in enumerate(jobs, 1):
         name = model.components[index].name
         results[name] = job.result()
@@ -110,11 +116,18 @@ def _absent_if_no_edges(found: MethodResults, results: Mapping[str, MethodResult
 
 
 def measure_component(
-    views: PhotoViews, index: int, part: Part | None, methods: Sequence[Method] = ("sweep", "edges")
+    views: PhotoViews,
+    index: int,
+    part: Part | None,
+    methods: Sequence[Method] = ("sweep", "edges"),
+    start: Array | None = None,
 ) -> MethodResults:
-    """Measure one component by both methods; if the edges fail, check whether the component is missing."""
+    """Measure one component by both methods; if the edges fail, check whether the component is missing.
+
+    With a near ``start`` (4,4) its edges are searched for only there, and elsewhere if few of them are.
+    """
     body = MeasuredComponent(views, index, part)
-    edges = _by_edges(body)
+    edges = _by_edges(body, start)
     if "sweep" not in methods and isinstance(edges, Move):
         return {"edges": edges}
     # The place found by edges is one more start of the sweep; the sweep's result there remains independent.
@@ -148,9 +161,11 @@ def _uncontradicted(sweep: Move | NotMeasured, edges: Move | NotMeasured) -> Mov
     )
 
 
-def _by_edges(body: MeasuredComponent) -> Move | NotMeasured:
+def _by_edges(body: MeasuredComponent, near: Array | None = None) -> Move | NotMeasured:
     """The component by its edges; by those at its joints, too, where the others leave directions undetermined."""
-    edges = ComponentEdges(body).measure()
+    edges = ComponentEdges(body).measure(near, is_near=near is not None)
+    if near is not None and not (isinstance(edges, Move) and edges.support >= RETRIED_SUPPORT):
+        edges = ComponentEdges(body).measure()
     count = 6 if isinstance(edges, NotMeasured) else len(edges.undetermined)
     if count == len(body.free):
         return edges

@@ -36,7 +36,7 @@ from arview.reconstruction.scale.cad import (
     shrunk,
 )
 from arview.reconstruction.scale.find import read_file, scale_of_cad
-from arview.reconstruction.scale.refine import JointRefiner, ScaleView
+from arview.reconstruction.scale.refine import CadEdgePoints, Fit, JointRefiner, ScaleView
 from arview.reconstruction.scale.similarity import Similarity
 from arview.reconstruction.scale.types import ScaleEvidence, ScaleResult
 from arview.reconstruction.types import PosedPhoto, SparseModel
@@ -49,6 +49,8 @@ MIN_EDGE_POINTS = 40
 """Edge points that say where a camera sees the part."""
 MIN_SHARE = 0.4
 """Share of the edges that a camera must show, and of the median camera's share beyond chance."""
+NEAR_SHARE = 0.6
+"""Share of a component's edges within a pixel and a half of where the fit has them, from which it is there."""
 RIG_ROUNDS = 3
 """Rounds in which cameras are placed by the part; the components' displacements settle with them."""
 MIN_LEFT = 2
@@ -89,6 +91,19 @@ class RigPlacement:
     found: CadFind | None
     moved: tuple[CameraShift, ...] = ()
     shifts: tuple[CameraShift, ...] = ()
+
+    @property
+    def near_places(self) -> dict[str, Array]:
+        """(4,4) measured_from_nominal of the components whose edges are mostly seen where the fit has them."""
+        if self.found is None:
+            return {}
+        fit, refiner = self.found.fit, self.found.refiner
+        shares = refiner.support(fit.similarity, [_displaced(one, fit) for one in fit.samples]).by_component
+        return {
+            component.name: rigid(np.eye(3), shift_mm)
+            for component, shift_mm, share in zip(refiner.model.components, fit.displacements_mm, shares, strict=True)
+            if share >= NEAR_SHARE
+        }
 
 
 def place_on_rig(
@@ -185,8 +200,7 @@ def camera_shift(found: CadFind, view: ScaleView) -> CameraShift:
     """
     refiner, similarity, center = found.refiner, found.fit.similarity, found.refiner.center
     pose = similarity.cam_from_model(view.cam_from_scan)
-    nominal = refiner.samples(view, pose)
-    samples = replace(nominal, points=nominal.points + found.fit.displacements_mm[nominal.component])
+    samples = _displaced(refiner.samples(view, pose), found.fit)
     none = CameraShift(view.name, None, np.zeros(6), np.diag(1.0 / _DAMPING))
     total, covariance = np.eye(4), none.covariance
     for reach_px in CHECK_REACHES_PX:
@@ -205,6 +219,11 @@ def camera_shift(found: CadFind, view: ScaleView) -> CameraShift:
     before, after = (view.camera.project(apply(at, samples.points)) for at in (pose, pose @ _about(total, center)))
     shift_px = float(np.sqrt(np.nanmean(np.sum((after - before) ** 2, axis=1))))
     return CameraShift(view.name, shift_px, log_se3(total), covariance[:6, :6] * 25.0)
+
+
+def _displaced(samples: CadEdgePoints, fit: Fit) -> CadEdgePoints:
+    """Edge points with each component where the fit has it."""
+    return replace(samples, points=samples.points + fit.displacements_mm[samples.component])
 
 
 @dataclass(frozen=True)

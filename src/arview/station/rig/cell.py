@@ -122,7 +122,8 @@ class Cell:
         if not sparse.photos:
             raise InputError("the cameras contradict each other: run `arview station calibrate` again")
         metric = measurement.MetricReconstruction(sparse.transformed(scale.scale, scale.model_from_scan), scale, None)
-        inspection = measurement.measure(metric, part, measurement.MeasureOptions(methods=METHODS))
+        options = measurement.MeasureOptions(methods=METHODS)
+        inspection = measurement.measure(metric, part, options, starts=placed.near_places)
         return inspection, {photo.name: photo.cam_from_scan for photo in metric.sparse.photos}
 
     def draw(self, cycle: Cycle) -> list[Path]:
