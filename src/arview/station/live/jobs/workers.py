@@ -82,8 +82,9 @@ class WorkerQueue:
     def __init__(
         self, options: JobOptions, start: Start | None = None, on_done: Callable[[walk.JobFolder], None] | None = None
     ) -> None:
-        here = partial(walk.start_worker, scheduler=options.scheduler, resources=options.resources)
-        self._options, self._start, self._on_done = options, start or here, on_done
+        if start is None and options.scheduler is not None:
+            start = partial(walk.start_worker, scheduler=options.scheduler, resources=options.resources)
+        self._options, self._start, self._on_done = options, start or walk.start_worker, on_done
         self._lock = threading.RLock()
         self._entries: dict[str, _Entry] = {}
         self._is_closed = False
