@@ -139,12 +139,12 @@ def test_the_line_triggers_and_is_told(station: Path, tmp_path: Path) -> None:
         command = [sys.executable, "-m", "arview", "station", "run", str(path), "--cycles", "2"]
         program = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
         try:
-            wait(lambda: answers(port), 120.0)
-            wait(lambda: post(port, {"id": "t-1", "serial": "S-1"}) == 202, 60.0)
+            wait(lambda: answers(port), 300.0)
+            wait(lambda: post(port, {"id": "t-1", "serial": "S-1"}) == 202, 120.0)
             assert post(port, {"id": "t-2", "seriel": "S-2"}) == 400
-            wait(consumer.result_keys, 120.0)
+            wait(consumer.result_keys, 400.0)
             consumer.publish("arview/cell 4/triggers", {"id": "t-3", "serial": "S-3", "order": "O-7"})
-            output, _ = program.communicate(timeout=120.0)
+            output, _ = program.communicate(timeout=400.0)
         finally:
             program.kill()
         wait(lambda: len(set(consumer.result_keys())) == 2 and consumer.of("alarms"))

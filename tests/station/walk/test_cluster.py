@@ -51,7 +51,7 @@ class Cluster:
             return subprocess.Popen(command, cwd=self.folder, stdout=log, stderr=log)
 
 
-def until(found: Callable[[], Any], timeout_s: float = 60.0) -> Any:
+def until(found: Callable[[], Any], timeout_s: float = 180.0) -> Any:
     """What a function returns as soon as it is something."""
     ends = time.monotonic() + timeout_s
     while not (value := found()):
@@ -94,7 +94,7 @@ def test_a_job_is_measured_on_the_cluster(dask: Cluster, tmp_path: Path) -> None
     job = new_job(tmp_path, "A-1")
     job.end()
     with start_worker(job, dask.url, {"GPU": 1}) as asking:
-        assert asking.wait(120.0) == 3
+        assert asking.wait(300.0) == 3
     assert job.state().stage == "failed" and "without a photo" in job.state().text
     assert "measured here" not in (job.path / "worker.log").read_text()
 
@@ -110,7 +110,7 @@ def test_killed_workers_and_a_killed_scheduler_lose_nothing(dask: Cluster, tmp_p
         assert until(lambda: working(job) == [again])
         dask.scheduler.kill()
         job.end()
-        assert asking.wait(120.0) == 3
+        assert asking.wait(300.0) == 3
     assert job.state().stage == "failed" and "without a photo" in job.state().text
     until(lambda: not working(job))
 
@@ -121,7 +121,7 @@ def test_without_a_cluster_the_job_is_measured_here(tmp_path: Path, monkeypatch:
     job = new_job(tmp_path, "A-3")
     job.end()
     with start_worker(job, "tcp://127.0.0.1:9") as asking:
-        assert asking.wait(120.0) == 3
+        assert asking.wait(300.0) == 3
     assert "no cluster at tcp://127.0.0.1:9: the job is measured here" in (job.path / "worker.log").read_text()
 
 
