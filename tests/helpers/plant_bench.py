@@ -34,7 +34,7 @@ def free_port() -> int:
         return int(line.getsockname()[1])
 
 
-def wait(condition: Callable[[], Any], timeout_s: float = 15.0) -> Any:
+def wait(condition: Callable[[], Any], timeout_s: float = 90.0) -> Any:
     """The first value of a condition that is true."""
     end_s = time.monotonic() + timeout_s
     while not (found := condition()):

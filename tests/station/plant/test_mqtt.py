@@ -37,7 +37,7 @@ def test_a_thousand_results_over_a_link_that_is_cut_five_times(tmp_path: Path) -
 
         def cut() -> None:
             for place in (50, 250, 450, 650, 850):
-                wait(lambda place=place: len(set(consumer.result_keys())) >= place, 20)
+                wait(lambda place=place: len(set(consumer.result_keys())) >= place, 120)
                 cuts.append(cable.cut(for_s=0.2))
 
         cutter = threading.Thread(target=cut)
@@ -47,7 +47,7 @@ def test_a_thousand_results_over_a_link_that_is_cut_five_times(tmp_path: Path) -
                 assert plant.publish(result(number))
             assert not plant.publish(result(0))  # the same inspection again
             cutter.join(20)
-            wait(lambda: pending(plant) == 0, 20)
+            wait(lambda: pending(plant) == 0, 120)
             wait(lambda: len(set(consumer.result_keys())) == RESULTS)
         told = consumer.result_keys()
     assert cuts == [1] * 5
@@ -87,7 +87,7 @@ def test_nothing_is_lost_when_the_program_is_killed(tmp_path: Path) -> None:
             published |= set(own)
         with Plant(mqtt_settings(tmp_path, port), tmp_path) as plant:
             wait(lambda: pending(plant) == 0 and is_connected(plant)())
-            wait(lambda: {int(key, 16) for key in consumer.result_keys()} >= published, 5)
+            wait(lambda: {int(key, 16) for key in consumer.result_keys()} >= published, 60)
         told = {int(key, 16) for key in consumer.result_keys()}
     assert len(published) >= 81
     assert len(told - published) <= 3  # written, but the program was killed before it could say so
@@ -102,7 +102,7 @@ def test_a_broker_that_stops_answering_is_noticed(tmp_path: Path, monkeypatch: p
             wait(is_connected(plant))
             cable.is_stalled = True
             plant.publish(result(1))
-            wait(lambda: not is_connected(plant)(), 5)
+            wait(lambda: not is_connected(plant)(), 60)
             assert plant.health()["outlets"]["mqtt"]["error"] == "Operation timed out"
             cable.is_stalled = False
             wait(lambda: pending(plant) == 0)
