@@ -107,7 +107,7 @@ def test_a_broker_that_stops_answering_is_noticed(tmp_path: Path, monkeypatch: p
             cable.is_stalled = False
             wait(lambda: pending(plant) == 0)
             started_s = time.monotonic()
-        assert time.monotonic() - started_s < 5.0
+        assert time.monotonic() - started_s < 8.0
         assert set(consumer.result_keys()) == {result(1).key}
 
 
