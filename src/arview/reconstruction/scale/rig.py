@@ -173,6 +173,11 @@ def without_moved(found: CadFind) -> tuple[CadFind, tuple[CameraShift, ...], tup
                 break
         order, kept = min(fewer, key=lambda one: one[0][0][0])
     shifts = tuple(camera_shift(kept, view) for view in views)
+    good = {one.name for one in shifts if one.shift_px is not None and one.shift_px < MOVED_PX}
+    if good > {view.name for view in kept.refiner.views}:
+        # A camera that was left out before the right one was agrees after all.
+        kept = _fitted(kept, [view for view in views if view.name in good])
+        shifts = tuple(camera_shift(kept, view) for view in views)
     left = {view.name for view in kept.refiner.views}
     # Two cameras that contradict each other do not say which of them has moved.
     if any(one.shift_px is None or one.shift_px >= MOVED_PX for one in shifts if one.name in left):
