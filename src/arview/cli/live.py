@@ -114,7 +114,6 @@ def _job_options(
     epilog="""\b
 Examples:
   arview live --part part.toml --inspection inspection.json
-  arview live --part part.toml --inspection inspection.json --camera phone.json --record session.mp4
   arview live --part part.toml --source rtsp://camera.local/1 --camera station.json
   arview live --part part.toml --source clip.mp4 --camera camera.json --http
   Notes: docs/reference/command-notes.md""",

@@ -18,8 +18,6 @@ from arview.cli.exit_codes import ExitCode, exit_code_of
 from arview.core.extras import require_extra
 from arview.core.progress import check_stop
 from arview.errors import InputError
-from arview.fiducials import parse_board
-from arview.inspection import overall_verdict, verdict_sentence
 from arview.station import rig as cell
 
 if TYPE_CHECKING:
@@ -31,9 +29,17 @@ INLETS = ("mqtt", "opcua", "http")
 _GRADES = {"good": ExitCode.DONE, "usable": ExitCode.UNDECIDED, "not enough": ExitCode.FAIL}
 
 
-@main.group("station", short_help="A cell of fixed cameras: calibrate, check, run.")
+@main.group(
+    "station",
+    short_help="A cell of fixed cameras: calibrate, check, run.",
+    epilog="""\b
+Examples:
+  arview station check --example
+  arview station calibrate station.toml --board charuco:12x9:20:15:DICT_5X5_250
+  arview station run station.toml""",
+)
 def station() -> None:
-    """A cell of fixed cameras that measures each part within its cycle; `arview station check -h` shows the file."""
+    """A cell of fixed cameras that measures each part within its cycle."""
 
 
 @station.command(
@@ -69,6 +75,8 @@ def calibrate(path: str, board: str | None, shots: int, interval_s: float) -> No
 
     Without a board they are found from the part, which every camera must show.
     """
+    from arview.fiducials import parse_board
+
     setup = cell.read_station(path)
     pattern = None if board is None else parse_board(board)
     lenses = {one.name: one.camera for one in setup.cameras}
@@ -101,7 +109,7 @@ def calibrate(path: str, board: str | None, shots: int, interval_s: float) -> No
     epilog="""\b
 Examples:
   arview station check station.toml
-  arview station check --example > station.toml""",
+  arview station check --example""",
     exit_codes={ExitCode.DONE: "good", ExitCode.FAIL: "not good enough to measure with", ExitCode.UNDECIDED: "usable"},
 )
 @click.argument("path", metavar="[STATION]", required=False)
@@ -162,6 +170,8 @@ def run(path: str, cycles: int | None, interval_s: float | None, serial: str | N
 
     With [mqtt], [opcua] or [http] in the file a trigger from there begins a cycle, and its result goes to all outlets.
     """
+    from arview.inspection import overall_verdict
+
     setup = cell.read_station(path)
     settings = _plant_of(setup)
     setup.table.finish()
@@ -234,6 +244,8 @@ def _line(setup: cell.Station, settings: Any) -> Iterator[plant.Plant | None]:
 
 def _tell(setup: cell.Station, line: plant.Plant | None, cycle: cell.Cycle, trigger: plant.Trigger | None) -> None:
     """Print the result of a cycle, and tell it to the outlets and the store, with the alarms that follow from it."""
+    from arview.inspection import verdict_sentence
+
     seconds = sum(cycle.seconds.values())
     click.echo(f"{cycle.folder.name}: {verdict_sentence(cycle.inspection)} ({seconds:.1f} s)")
     for warning in cycle.inspection.warnings:
