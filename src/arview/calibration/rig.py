@@ -39,8 +39,6 @@ COMMON_PX = 0.03
 """Standard deviation of an error that all corners of one picture share: lens, blur, a board that is not quite flat."""
 MIN_SIGMA_PX = 0.03
 """Corners of a board are not found better than this."""
-PRINT_STD = 2e-4
-"""Relative standard deviation of the size of a printed board."""
 GOOD_SHOTS, GOOD_PX, USABLE_PX = 5, 0.4, 1.0
 """Shots of each camera, and residual, of a good rig; and the residual up to which one is usable."""
 FORMAT = "arview rig 1"
@@ -159,17 +157,7 @@ class CameraRig:
             for i in chosen
         )
         rows = np.concatenate([np.arange(6 * i, 6 * i + 6) for i in chosen]) if chosen else np.zeros(0, dtype=int)
-        none = np.zeros(0, dtype=np.int32)
-        return reconstruction.SparseModel(
-            photos,
-            np.zeros((0, 3)),
-            np.zeros((0, 3), dtype=np.uint8),
-            np.zeros(0),
-            none,
-            none,
-            np.zeros((0, 2)),
-            pose_covariance=self.covariance[np.ix_(rows, rows)],
-        )
+        return reconstruction.SparseModel.without_points(photos, self.covariance[np.ix_(rows, rows)])
 
 
 Shot = Mapping[str, Path]
@@ -209,7 +197,7 @@ def rig_from_board(shots: Sequence[Shot], cameras: Mapping[str, Camera], board: 
         lenses,
         np.array(system.cams_from_rig),
         system.covariance(),
-        PRINT_STD,
+        reconstruction.PRINT_STD,
         residuals_px=residuals,
         shots=counts,
         source=f"{board} in {len(boards)} shots",

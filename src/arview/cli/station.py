@@ -258,9 +258,8 @@ def _tell(setup: cell.Station, line: plant.Plant | None, cycle: cell.Cycle, trig
         from arview.station import plant
 
         line.publish(plant.result_of(cycle.inspection, setup.name, trigger))
-        for name in (one.name for one in setup.cameras):
-            text = next((one for one in cycle.inspection.warnings if one.startswith(f"camera {name}")), "")
-            line.set_alarm("camera_moved", name, text, "error")
+        for camera in setup.cameras:
+            line.set_alarm("camera_moved", camera.name, cycle.faults.get(camera.name, ""), "error")
         if kept is not None:
             for text in line.check_history(kept, setup.part.name):
                 say(text)

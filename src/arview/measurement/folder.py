@@ -155,16 +155,6 @@ def _own_ply(path: Path) -> DenseCloud | None:
 
 def _cloud_alone(cloud: DenseCloud, warnings: tuple[str, ...], factors: tuple[float, ...]) -> MetricReconstruction:
     """A reconstruction without photos."""
-    none = np.zeros(0)
-    empty = SparseModel(
-        (),
-        np.zeros((0, 3)),
-        np.zeros((0, 3), np.uint8),
-        none,
-        none.astype(np.int32),
-        none.astype(np.int32),
-        np.zeros((0, 2)),
-    )
     scale = ScaleResult(
         1.0,
         None,
@@ -175,7 +165,7 @@ def _cloud_alone(cloud: DenseCloud, warnings: tuple[str, ...], factors: tuple[fl
         why_no_frame="a cloud without photos",
         consistency=Consistency(True, ""),
     )
-    return MetricReconstruction(empty, scale, cloud, factors)
+    return MetricReconstruction(SparseModel.without_points(), scale, cloud, factors)
 
 
 def in_model_frame(reconstruction: MetricReconstruction, part: Part) -> MetricReconstruction:

@@ -60,6 +60,7 @@ if TYPE_CHECKING:
     from arview.reconstruction.scale.specs import load_rig as load_rig
     from arview.reconstruction.scale.specs import load_scale_file as load_scale_file
     from arview.reconstruction.scale.specs import parse_scale_bar as parse_scale_bar
+    from arview.reconstruction.scale.targets import PRINT_STD as PRINT_STD
     from arview.reconstruction.scale.types import Consistency as Consistency
     from arview.reconstruction.scale.types import ScaleEvidence as ScaleEvidence
     from arview.reconstruction.scale.types import ScaleResult as ScaleResult
@@ -152,6 +153,7 @@ __getattr__, __dir__, __all__ = lazy_door(
             "load_scale_file",
             "parse_scale_bar",
         ),
+        "scale.targets": ("PRINT_STD",),
         "scale.types": (
             "Consistency",
             "ScaleEvidence",

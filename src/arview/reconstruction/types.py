@@ -97,6 +97,16 @@ class SparseModel:
         if not np.isfinite(self.points_in_scan).all():
             raise InputError("sparse model: a point is NaN or infinite")
 
+    @classmethod
+    def without_points(cls, photos: tuple[PosedPhoto, ...] = (), pose_covariance: Array | None = None) -> SparseModel:
+        """Photos whose poses are known, or none, and no point."""
+        none = np.zeros(0, dtype=np.int32)
+        colors = np.zeros((0, 3), dtype=np.uint8)
+        observed_px = np.zeros((0, 2))
+        return cls(
+            photos, np.zeros((0, 3)), colors, np.zeros(0), none, none, observed_px, pose_covariance=pose_covariance
+        )
+
     @property
     def lens_stds(self) -> Array | None:
         """(3,) how much the lens changes from photo to photo; None where photos share lenses.

@@ -1,10 +1,10 @@
 """One part tracked by several fixed, synchronous cameras at once: one pose, as exact in depth as across.
 
 A camera measures what lies across its axis well and depth badly; another camera beside it measures that depth across.
-The first camera is followed by a whole session, with detection, identity and presence. Each of the others only refines
-the pose that is expected, and its pose enters the session as a prior with its covariance, about the same point of the
-part and so in the same coordinates (Stoiber et al., "A Multi-body Tracking Framework", 2022, join the equations of
-several cameras instead, which costs each of them a whole search).
+The first camera is followed by a whole session, with detection, identity and presence. Each of the others only
+refines the pose that the session found. The mean of both is taken by their covariances, as that of a `PosePrior`: both
+are about the same point of the part and so in the same coordinates. (Stoiber et al., "A Multi-body Tracking
+Framework", 2022, join the equations of several cameras instead, which costs each of them a whole search.)
 """
 
 from __future__ import annotations

@@ -70,15 +70,15 @@ def rig_rows(details: dict[str, Any]) -> list[ResultRow]:
             errors.append(abs(one.distance_mm - true))
             held.append(errors[-1] <= one.uncertainty_mm)
             wrong += one.verdict is (Verdict.FAIL if true <= 0.6 else Verdict.PASS)
-        named = sum(cycle.moved == (names[number % cameras],) for number, cycle in enumerate(cycles[2:]))
+        named = sum(tuple(cycle.faults) == (names[number % cameras],) for number, cycle in enumerate(cycles[2:]))
         bound_um = 1000 * 430.0 / CAMERA.fx * 0.1 / np.sqrt(cameras)
         on = f"{count} components, {cameras} cameras of 2 Mpx"
         text = f"median {1000 * np.median(errors):.1f}, 95 % {1000 * np.quantile(errors, 0.95):.1f} um"
         text += f" (geometry {bound_um:.0f}), {missing} not measured, {wrong} wrong"
         is_good = float(np.median(errors)) <= MEDIAN_MM and not missing and not wrong
         rows.append(ResultRow("rig: displacement", on, text, "median <= 25 um", is_good))
-        text = f"{named} of {len(TURNS_DEG)}; none else: {not cycles[0].moved and not cycles[1].moved}"
-        is_good = named == len(TURNS_DEG) and not cycles[0].moved and not cycles[1].moved
+        text = f"{named} of {len(TURNS_DEG)}; none else: {not cycles[0].faults and not cycles[1].faults}"
+        is_good = named == len(TURNS_DEG) and not cycles[0].faults and not cycles[1].faults
         rows.append(ResultRow("rig: turned by 0.1°, named", on, text, "all", is_good))
         target_s = 4.0 if count <= 16 else 10.0
         text = f"{seconds[1]:.1f} s ({cpu_s[1]:.1f} CPU-s); the first {seconds[0]:.1f} s"

@@ -6,13 +6,12 @@ out without which the others agree best.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import inf
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from arview.cad import Part
 from arview.camera import Camera
@@ -75,6 +74,18 @@ class CameraShift:
     model_twist: Array
     covariance: Array
 
+    @property
+    def px(self) -> float:
+        """The shift; infinite where the picture does not show the part."""
+        return inf if self.shift_px is None else self.shift_px
+
+    @property
+    def text(self) -> str:
+        """What is said of the camera if it has moved."""
+        if self.shift_px is None:
+            return f"camera {self.name}: does not show the part where the other cameras have it: covered, or moved far"
+        return f"camera {self.name} has moved: it sees the part {self.shift_px:.1f} px from where the others have it"
+
 
 @dataclass(frozen=True)
 class RigPlacement:
@@ -84,13 +95,11 @@ class RigPlacement:
         scale: scale and frame, with a warning for each camera that has moved.
         found: the fit, from which the next part is found faster; None: the part was not found.
         moved: cameras that are not where they were calibrated, or whose picture does not show the part.
-        shifts: of all cameras.
     """
 
     scale: ScaleResult
     found: CadFind | None
     moved: tuple[CameraShift, ...] = ()
-    shifts: tuple[CameraShift, ...] = ()
 
     @property
     def near_places(self) -> dict[str, Array]:
@@ -107,11 +116,7 @@ class RigPlacement:
 
 
 def place_on_rig(
-    sparse: SparseModel,
-    part: Part,
-    known: ScaleEvidence,
-    before: RigPlacement | None = None,
-    read: Callable[[PosedPhoto], NDArray[np.uint8]] | None = None,
+    sparse: SparseModel, part: Part, known: ScaleEvidence, before: RigPlacement | None = None
 ) -> RigPlacement:
     """Where a part lies under a rig, by the cameras that agree.
 
@@ -120,80 +125,78 @@ def place_on_rig(
         part: to be found.
         known: the scale of the rig: 1 and its relative standard deviation.
         before: the last part, from which this one is found faster.
-        read: returns the upright (H,W,3) uint8 RGB picture of a photo; default: from its file.
     """
-    read = read or read_file
-    found = _found(sparse.photos, read, part, before)
+    found = _found(sparse.photos, part, before)
     if not isinstance(found, CadFind):
         return RigPlacement(scale_of_cad(sparse, part, found, [known], []), None)
-    kept, moved, shifts = without_moved(found)
+    kept, moved = without_moved(found)
     left = {view.name for view in kept.refiner.views}
     agreeing = replace(sparse, photos=tuple(photo for photo in sparse.photos if photo.name in left))
-    warnings = [_moved_text(one) for one in moved]
-    return RigPlacement(scale_of_cad(agreeing, part, kept, [known], warnings), kept, moved, shifts)
+    return RigPlacement(scale_of_cad(agreeing, part, kept, [known], [one.text for one in moved]), kept, moved)
 
 
-def _found(
-    photos: Sequence[PosedPhoto],
-    read: Callable[[PosedPhoto], NDArray[np.uint8]],
-    part: Part,
-    before: RigPlacement | None,
-) -> CadFind | NotFound:
+def _found(photos: Sequence[PosedPhoto], part: Part, before: RigPlacement | None) -> CadFind | NotFound:
     """The part by all cameras; if these contradict each other, by all but those that had moved, or but one."""
     last = None if before is None else before.found
-    found = find_cad(photos, read, part, CadOptions(), before=last)
+    found = find_cad(photos, read_file, part, CadOptions(), before=last)
     suspects = [{one.name for one in before.moved}] if before is not None and before.moved else []
     for out in [*suspects, *({photo.name} for photo in photos)]:
         some = [photo for photo in photos if photo.name not in out]
         if isinstance(found, CadFind) or not found.is_contradiction or len(some) < MIN_LEFT:
             break
-        found = find_cad(some, read, part, CadOptions(), before=last)
+        found = find_cad(some, read_file, part, CadOptions(), before=last)
     if not isinstance(found, CadFind) or len(found.refiner.views) == len(photos):
         return found
-    views = [make_view(photo, read(photo), CadOptions().max_side_px) for photo in photos]
-    refiner = JointRefiner(part.model, found.refiner.base, views)
-    return replace(found, refiner=refiner, support=refiner.support(found.fit.similarity))
+    return _fitted(found, _views_of(photos), refits=False)
 
 
-def without_moved(found: CadFind) -> tuple[CadFind, tuple[CameraShift, ...], tuple[CameraShift, ...]]:
-    """The fit to the cameras that agree, those that do not, and what all of them see."""
-    views, shares = found.refiner.views, found.support.by_view
-    usual = float(np.nanmedian(shares))
-    blind = {view.name for view, share in zip(views, shares, strict=True) if not share >= MIN_SHARE * usual}
-    kept = found
-    if blind and len(views) - len(blind) >= MIN_LEFT:
-        kept = _fitted(found, [view for view in views if view.name not in blind])
-    order = _by_shift(kept)
-    while order[0][0] >= MOVED_PX and len(order) > MIN_LEFT:
-        fewer = []
-        for _, name in order:
+def without_moved(found: CadFind) -> tuple[CadFind, tuple[CameraShift, ...]]:
+    """The fit to the cameras that agree, and those that do not."""
+    views, by_view = found.refiner.views, found.support.by_view
+    usual = float(np.nanmedian(by_view))
+    clear = [view for view, share in zip(views, by_view, strict=True) if share >= MIN_SHARE * usual]
+    kept = found if len(clear) in (len(views), *range(MIN_LEFT)) else _fitted(found, clear)
+    shifts = _shifts(kept)
+    while _worst_px(shifts) >= MOVED_PX and len(shifts) > MIN_LEFT:
+        fewer: list[tuple[CadFind, dict[str, CameraShift]]] = []
+        for name in sorted(shifts, key=lambda name: (shifts[name].px, name), reverse=True):
             fit = _fitted(kept, [view for view in kept.refiner.views if view.name != name])
-            fewer.append((_by_shift(fit), fit))
-            if fewer[-1][0][0][0] < MOVED_PX:
+            fewer.append((fit, _shifts(fit)))
+            if _worst_px(fewer[-1][1]) < MOVED_PX:
                 break
-        order, kept = min(fewer, key=lambda one: one[0][0][0])
-    shifts = tuple(camera_shift(kept, view) for view in views)
-    good = {one.name for one in shifts if one.shift_px is not None and one.shift_px < MOVED_PX}
-    if good > {view.name for view in kept.refiner.views}:
+        kept, shifts = min(fewer, key=lambda one: _worst_px(one[1]))
+    out = {view.name: camera_shift(kept, view) for view in views if view.name not in shifts}
+    if back := [name for name, shift in out.items() if shift.px < MOVED_PX and _worst_px(shifts) < MOVED_PX]:
         # A camera that was left out before the right one was agrees after all.
-        kept = _fitted(kept, [view for view in views if view.name in good])
-        shifts = tuple(camera_shift(kept, view) for view in views)
-    left = {view.name for view in kept.refiner.views}
+        kept = _fitted(kept, [view for view in views if view.name in shifts or view.name in back])
+        shifts = _shifts(kept)
+        out = {view.name: camera_shift(kept, view) for view in views if view.name not in shifts}
     # Two cameras that contradict each other do not say which of them has moved.
-    if any(one.shift_px is None or one.shift_px >= MOVED_PX for one in shifts if one.name in left):
-        return kept, shifts, shifts
-    return kept, tuple(one for one in shifts if one.name not in left), shifts
+    if _worst_px(shifts) >= MOVED_PX:
+        out |= shifts
+    return kept, tuple(out[view.name] for view in views if view.name in out)
 
 
-def _by_shift(found: CadFind) -> list[tuple[float, str]]:
-    """Shift in px and name of each camera, the largest first; infinite where the picture does not show the part."""
-    shifts = (camera_shift(found, view) for view in found.refiner.views)
-    return sorted(((inf if one.shift_px is None else one.shift_px, one.name) for one in shifts), reverse=True)
+def _shifts(found: CadFind) -> dict[str, CameraShift]:
+    """`camera_shift` of each camera of a fit, by its name."""
+    return {view.name: camera_shift(found, view) for view in found.refiner.views}
 
 
-def _fitted(found: CadFind, views: list[ScaleView]) -> CadFind:
-    """The fit to some of the views."""
+def _worst_px(shifts: Mapping[str, CameraShift]) -> float:
+    """The largest shift."""
+    return max(shift.px for shift in shifts.values())
+
+
+def _views_of(photos: Sequence[PosedPhoto]) -> list[ScaleView]:
+    """The pictures of the cameras, from their files."""
+    return [make_view(photo, read_file(photo), CadOptions().max_side_px) for photo in photos]
+
+
+def _fitted(found: CadFind, views: Sequence[ScaleView], refits: bool = True) -> CadFind:
+    """The fit to some views, or without ``refits`` how these support the fit as it is."""
     refiner = JointRefiner(found.refiner.model, found.refiner.base, views)
+    if not refits:
+        return replace(found, refiner=refiner, support=refiner.support(found.fit.similarity))
     fit = refiner.refine(found.fit.similarity)
     return replace(found, fit=fit, support=refiner.support(fit.similarity, fit.samples), refiner=refiner)
 
@@ -307,8 +310,7 @@ def _pose_of_part(path: Path, camera: Camera, part: Part, name: str) -> Array:
 def _fit_of_shot(photos: Sequence[PosedPhoto], part: Part, is_first: bool) -> CadFind:
     """The part in one shot; in the first one it lies where the rig's frame is."""
     if is_first:
-        views = [make_view(photo, read_file(photo), CadOptions().max_side_px) for photo in photos]
-        refiner = JointRefiner(part.model, base_names(part), views)
+        refiner = JointRefiner(part.model, base_names(part), _views_of(photos))
         fit = refiner.refine(Similarity(1.0, np.eye(4)))
         return CadFind(fit, refiner.support(fit.similarity), refiner, "", (), np.zeros((0, 3, 3)))
     found = find_cad(photos, read_file, part, CadOptions())
@@ -330,10 +332,3 @@ def _about(motion: Array, center: Array) -> Array:
     """A motion (4,4) about a point of the model."""
     to_center = rigid(np.eye(3), center)
     return np.asarray(to_center @ motion @ invert(to_center))
-
-
-def _moved_text(shift: CameraShift) -> str:
-    """What is said of a camera that has moved."""
-    if shift.shift_px is None:
-        return f"camera {shift.name}: does not show the part where the other cameras have it: covered, or moved far"
-    return f"camera {shift.name} has moved: it sees the part {shift.shift_px:.1f} px from where the others have it"

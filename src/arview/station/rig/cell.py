@@ -32,16 +32,15 @@ class Cycle:
     Attributes:
         inspection: with no component measured where the part was not found.
         folder: of its files: pictures, ``inspection.json``, pictures with labels.
-        moved: cameras that have moved, or do not show the part: nothing was measured from them.
-        missing: cameras without a picture, and why.
+        faults: a sentence for each camera, by its name, that gave no picture, has moved or does not show the part:
+            nothing was measured from it.
         cams_from_model: pose of the part in each camera that was used.
         seconds: how long pictures, placing and measuring took.
     """
 
     inspection: Inspection
     folder: Path
-    moved: tuple[str, ...] = ()
-    missing: dict[str, str] = field(default_factory=dict)
+    faults: dict[str, str] = field(default_factory=dict)
     cams_from_model: dict[str, Array] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
 
@@ -84,33 +83,38 @@ class Cell:
         if not files:
             folder.rmdir()
             raise InputError(f"no camera gives a picture: {'; '.join(f'{k}: {v}' for k, v in missing.items())}")
-        taken = time.monotonic()
+        found_s = taken_s = time.monotonic()
         part = self.station.part if serial is None else replace(self.station.part, serial=serial)
-        sparse = self.rig.posed(files)
-        detail = f"rig of {len(self.rig.names)} cameras, from {self.rig.source}"
-        known = reconstruction.ScaleEvidence("rig", 1.0, self.rig.scale_std, detail)
-        warnings = [f"camera {name}: gave no picture: {why}" for name, why in missing.items()]
+        faults = {name: f"camera {name}: gave no picture: {why}" for name, why in missing.items()}
+        warnings, poses = list(faults.values()), dict[str, Array]()
         try:
-            placed = reconstruction.place_on_rig(sparse, part, known, self._before)
-            self._before = placed if placed.found is not None else self._before
-            moved = tuple(one.name for one in placed.moved)
-            seen = self.rig.posed({name: path for name, path in files.items() if name not in moved})
-            found_s = time.monotonic()
-            inspection, poses = self._measured(seen, placed, part)
+            with reconstruction.keeping_photos():
+                placed = self._placed(files, part)
+                faults |= {one.name: one.text for one in placed.moved}
+                found_s = time.monotonic()
+                seen = self.rig.posed({name: path for name, path in files.items() if name not in faults})
+                inspection, poses = self._measured(seen, placed, part)
         except InputError as error:
-            inspection, poses, moved = new_inspection(part, serial=serial), {}, ()
+            inspection = new_inspection(part, serial=serial)
             warnings.append(str(error))
-            found_s = time.monotonic()
         inspection = replace(
             inspection,
             warnings=(*warnings, *inspection.warnings),
             provenance=replace(inspection.provenance, tool="arview station"),
         )
         save_inspection(inspection, folder / "inspection.json")
-        done = time.monotonic()
+        done_s = time.monotonic()
         self._remove_old()
-        seconds = {"pictures": taken - began, "placing": found_s - taken, "measuring": done - found_s}
-        return Cycle(inspection, folder, moved, missing, cams_from_model=poses, seconds=seconds)
+        seconds = {"pictures": taken_s - began, "placing": found_s - taken_s, "measuring": done_s - found_s}
+        return Cycle(inspection, folder, faults, cams_from_model=poses, seconds=seconds)
+
+    def _placed(self, files: dict[str, Path], part: Part) -> reconstruction.RigPlacement:
+        """Where the part lies, by the cameras that agree."""
+        detail = f"rig of {len(self.rig.names)} cameras, from {self.rig.source}"
+        known = reconstruction.ScaleEvidence("rig", 1.0, self.rig.scale_std, detail)
+        placed = reconstruction.place_on_rig(self.rig.posed(files), part, known, self._before)
+        self._before = self._before if placed.found is None else placed
+        return placed
 
     def _measured(
         self, sparse: reconstruction.SparseModel, placed: reconstruction.RigPlacement, part: Part
