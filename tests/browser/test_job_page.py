@@ -184,7 +184,8 @@ def test_result_comes_without_a_reload_and_is_signed(chromium: Any, server: Runn
         job = capture(page, jobs)
         page.click("#job-hud .shutter")
         page.click("#job-hud .hud-done")
-        until(page, lambda: ("end", {}) in jobs.said and len(jobs.stored) == 1)
+        until(page, lambda: len(jobs.stored) == 1)
+        until(page, lambda: ("end", {}) in jobs.said)
         until(page, lambda: "Measuring: 1 photo" in page.inner_text("#job"))
         found = {
             "verdict": "fail",

@@ -32,6 +32,8 @@ class ToldJobs:
         stored: content of the photos that arrived, in order.
         attached: content of those that were taken for decisions.
         uploads: content so far by the name of an upload.
+        begun: what was said of an upload when it began, by its name.
+        names: of the photos that arrived, by the name of their upload.
         refusals: the next answers to pieces: status and document; an empty list answers as a station does.
         drawings: of components, by name; another one without.
         lost: number of the next pieces that arrive while their answers do not.
@@ -43,6 +45,7 @@ class ToldJobs:
     attached: list[bytes] = field(default_factory=list)
     uploads: dict[str, bytearray] = field(default_factory=dict)
     begun: dict[str, dict[str, Any]] = field(default_factory=dict)
+    names: dict[str, str] = field(default_factory=dict)
     refusals: list[tuple[int, dict[str, Any]]] = field(default_factory=list)
     said: list[tuple[str, dict[str, Any]]] = field(default_factory=list)
     drawings: dict[str, bytes] = field(default_factory=dict)
@@ -136,6 +139,8 @@ class ToldJobs:
         if upload not in self.uploads:
             return 404, {"error": "not_found", "message": "no such upload"}
         kept = self.uploads[upload]
+        if upload in self.names:  # its answer was lost, or came too late for the page
+            return 200, {"photo": self.names[upload], "offset": len(kept)}
         if method == "GET":
             return 200, {"offset": len(kept)}
         if self.refusals:
@@ -156,9 +161,10 @@ class ToldJobs:
         if about["purpose"] == "decide":
             self.attached.append(bytes(kept))
             job["attachments"].append(f"decisions/{about['sha256']}.jpg")
+            self.names[upload] = job["attachments"][-1]
             return 200, {"photo": job["attachments"][-1]}
         self.stored.append(bytes(kept))
-        photo = f"{len(self.stored):04d}.jpg"
+        self.names[upload] = photo = f"{len(self.stored):04d}.jpg"
         job["photos"].append(photo)
         job["state"]["photos"] = len(job["photos"])
         return 200, {"photo": photo}

@@ -116,7 +116,7 @@ Examples:
   arview live --part part.toml --inspection inspection.json
   arview live --part part.toml --source rtsp://camera.local/1 --camera station.json
   arview live --part part.toml --source clip.mp4 --camera camera.json --http
-  Notes: docs/reference/command-notes.md""",
+  arview live --part part.toml --scheduler tcp://cluster.local:8786 --resources GPU=1""",
     exit_codes={ExitCode.INTERRUPTED: "ended by Ctrl-C; files are finished"},
 )
 @click.option(
@@ -253,7 +253,7 @@ def live(
     renderer: str,
     unit: str | None,
 ) -> None:
-    """Serve the overlay of PART, or of several, to phones and screens in the local network."""
+    """Serve the overlay of PARTs to phones and screens; notes: docs/reference/command-notes.md."""
     import asyncio
 
     require_extra("arview live", "station")
