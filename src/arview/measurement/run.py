@@ -15,10 +15,18 @@ from threadpoolctl import threadpool_limits
 
 from arview.cad import Datum, Model, Part
 from arview.core.checks import PATH, check_type
+from arview.core.parallel import pool
 from arview.core.progress import Progress
 from arview.errors import InputError
 from arview.geometry import Array
-from arview.inspection import CharacteristicResult, DistanceReport, FailedDatum, ForeignReport, Inspection
+from arview.inspection import (
+    CharacteristicResult,
+    ComponentDeviation,
+    DistanceReport,
+    FailedDatum,
+    ForeignReport,
+    Inspection,
+)
 from arview.measurement.characteristics import OF_WHOLE_NOTE, Frames, MeasureFeature, measure_characteristics
 from arview.measurement.cloud.points import CloudPoints
 from arview.measurement.cloud_report import inspect_cloud, scatter_doubts
@@ -141,10 +149,14 @@ def _measure(
         poses = PosePropagation(reconstruction.sparse, part.model, alignment, base)
     deviations = []
     seen, is_hidden = seen_from(reconstruction.sparse, part.model), is_mostly_hidden(consistency)
-    for done, name in enumerate(names, 1):
+
+    def recorded(name: str) -> ComponentDeviation:
         record = component_record(name, results[name], measurands[name], alignment, poses, part, options)
         record = in_partial_frame(record, failed)
-        deviations.append(with_seen_from(with_hidden(record, MOSTLY_HIDDEN) if is_hidden else record, seen))
+        return with_seen_from(with_hidden(record, MOSTLY_HIDDEN) if is_hidden else record, seen)
+
+    for done, record in enumerate(pool().map(recorded, names), 1):
+        deviations.append(record)
         tell("uncertainty", done, len(names))
     if BY_SHAPE in warnings:
         deviations, doubts = with_unsure_names(deviations, part)

@@ -24,7 +24,8 @@ from arview.measurement.datums.plane_edges import DATUM_EDGE_PX, FINE_REACH_PX, 
 from arview.measurement.datums.planes import inside_triangles, plane_neighbours, plane_samples
 from arview.measurement.datums.rims import Rim, find_rim
 from arview.measurement.datums.roundness import rim_shift_mm, waves
-from arview.measurement.photo.edges import HALF_SLOPE, MIN_POINTS, edge_offsets
+from arview.measurement.photo.edge_offsets import HALF_SLOPE, edge_offsets
+from arview.measurement.photo.edges import MIN_POINTS
 from arview.measurement.photo.patches import near_edges, near_others, tangents_of
 from arview.measurement.photo.rival_edges import EdgePoints
 from arview.measurement.photo.sweep import MIN_SAMPLES, MIN_SIGMA_MM, MIN_VIEWS, PATCH_PX, SWEEP_EDGE_PX, sweep_offsets

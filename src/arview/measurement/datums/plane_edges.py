@@ -12,14 +12,8 @@ from arview.geometry import Array, exp_so3, log_so3, rigid
 from arview.measurement.datums.equations import DatumEquations, DatumNotMeasuredError, move_equations
 from arview.measurement.datums.options import REACH_MM
 from arview.measurement.photo.component import MeasuredComponent
-from arview.measurement.photo.edges import (
-    HALF_SLOPE,
-    MAX_DARK_SHIFT_PX,
-    MIN_POINTS,
-    MIN_SIGMA_PX,
-    ComponentEdges,
-    edge_offsets,
-)
+from arview.measurement.photo.edge_offsets import HALF_SLOPE, edge_offsets
+from arview.measurement.photo.edges import MAX_DARK_SHIFT_PX, MIN_POINTS, MIN_SIGMA_PX, ComponentEdges
 from arview.measurement.photo.fit import RigidFit, fit_rigid, move_rows
 from arview.measurement.photo.patches import tangents_of
 from arview.measurement.photo.rival_edges import EdgePoints, rival_offsets_px

@@ -1,6 +1,6 @@
 """Positions of components measured in the photos themselves: from their surfaces (sweep) and from their edges."""
 
-from arview.measurement.photo.edges import EdgeOffsets, edge_offsets
+from arview.measurement.photo.edge_offsets import EdgeOffsets, edge_offsets
 from arview.measurement.photo.measure import measure_components_in_photos
 from arview.measurement.photo.rival_edges import EdgePoints
 from arview.measurement.photo.sweep import SweepOffsets, sweep_offsets

@@ -7,21 +7,18 @@ and one rigid motion of the component in space is fitted to all steps.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
 from arview.cad import make_model
-from arview.camera import Camera
 from arview.core.kernel import kernel
-from arview.core.subpixel_edges import choose_steps, find_steps, linear_light
 from arview.geometry import Array, apply, invert, rigid
 from arview.measurement.photo.component import MeasuredComponent
+from arview.measurement.photo.edge_offsets import HALF_SLOPE, EdgeOffsets, edge_offsets, edge_rays, steps_across
 from arview.measurement.photo.fit import RigidFit, fit_rigid, move_rows
 from arview.measurement.photo.options import UNDETERMINED_MM
 from arview.measurement.photo.patches import near_others
-from arview.measurement.photo.rival_edges import EdgePoints, merged_shift_px, rival_offsets_px
+from arview.measurement.photo.rival_edges import EdgePoints, rival_offsets_px
 from arview.measurement.photo.views import PhotoViews
 from arview.measurement.types import Move, NotMeasured
 from arview.rendering import EDGE_CREASE, EDGE_SILHOUETTE, sample_visible_edges
@@ -35,12 +32,6 @@ SPACING_PX = 3.0
 """Distance between samples along an edge."""
 MAX_POINTS = 3000
 """Edge points of one component in all photos; more are redundant."""
-HALF_WIDTH_PX = 2.0
-"""Profiles are averaged over this distance to either side along the edge."""
-THRESHOLD = 1.0
-"""Weakest step, in grey levels (of 255) per px in linear light."""
-HALF_SLOPE = 6.0
-"""Slope at which a step has half its full weight."""
 MIN_SIGMA_PX = 0.05
 """Lower bound of the residuals' standard deviation: lens, tessellation, pixel response."""
 MAX_DARK_SHIFT_PX = 0.2
@@ -61,8 +52,6 @@ RIVAL_REACH_PX = 6.0
 """An edge farther than this is no rival: the last rounds search half as far."""
 FINE_ROUNDS = 3
 """Number of the last rounds."""
-BLUR_PX = 1.0
-"""Standard deviation of a step's blur: lens, sensor, smoothing, and the samples of a profile."""
 FLANKED_PX = 0.5
 """Systematic standard deviation where all edges have others beside them: half their gap."""
 SMALL_PX, SMALL_SIZES_PX = 0.15, (30.0, 90.0)
@@ -72,127 +61,6 @@ WEAK_SUPPORT, WEAK_PX = 0.5, 3.0
 """Support below which what hides the edges may have taken their place, and the standard deviation by the lack of it."""
 SYSTEMATIC_PX = 0.03
 """Standard deviation of a common shift of all edges of a component: chamfers, light."""
-
-
-@dataclass(frozen=True)
-class EdgeOffsets:
-    """Steps of brightness near predicted edge points.
-
-    Attributes:
-        directions: (N,3) unit vectors in the model, across the edge and the line of sight; only this component of a
-            displacement is visible in the photo.
-        offsets_mm: (N,) position of the step along the direction; 0 where there is none.
-        mm_per_px: (N,) size of a pixel in that direction.
-        slopes: (N,) grey levels per px in linear light, positive where it gets brighter along the direction; 0 where
-            there is no step.
-        seen: (N,) whether the point is inside the photo.
-        hypotheses_mm, strengths: (N,K) positions and slopes of all steps found, 0 = none.
-        pose_rows: (N,6) derivative of the offset by the twist of its photo's pose.
-        merged_mm: (N,) by how much the blurred step of another edge beside it may shift the step.
-    """
-
-    directions: Array
-    offsets_mm: Array
-    mm_per_px: Array
-    slopes: Array
-    seen: NDArray[np.bool_]
-    hypotheses_mm: Array
-    strengths: Array
-    pose_rows: Array
-    merged_mm: Array
-
-
-def edge_offsets(
-    edges: EdgePoints,
-    center: Array,
-    views: PhotoViews,
-    reach_px: float,
-    level: int = 0,
-    shift_px: float = 0.0,
-    gaps_px: Array | None = None,
-) -> EdgeOffsets:
-    """Find a step of brightness across each predicted edge point.
-
-    Args:
-        edges: points in photos that are known to show them.
-        center: (3,) point from which the directions lead away.
-        views: the photos.
-        reach_px: search range to either side, px of the level.
-        level: resolution of the photos: 0 is full size, each further level half of it.
-        shift_px: search this far beside the edge; what is found there is due to chance.
-        gaps_px: (N,2) of `rival_offsets_px`, in px of full size; None: no edge has another one beside it.
-    """
-    n = len(edges.points)
-    gap = np.full(n, np.inf)
-    directions, mm_per_px, twists = np.zeros((n, 3)), np.ones(n), np.zeros((n, 6))
-    hypotheses, strengths, seen = np.zeros((n, 4)), np.zeros((n, 4)), np.zeros(n, dtype=bool)
-    for view in np.unique(edges.view):
-        of = np.flatnonzero(edges.view == view)
-        camera, pose = views.cameras[view], views.cam_from_model[view]
-        width, height = views.levels[level].sizes[view]
-        camera = camera.scaled(int(width), int(height)) if level else camera
-        in_cam = apply(pose, edges.points[of])
-        pixels = camera.project(in_cam)
-        normals, by_cam = _across(camera, in_cam, pixels, edges.tangents[of] @ pose[:3, :3].T)
-        by_model = by_cam @ pose[:3, :3]
-        outward = np.where(np.sum(by_model * (edges.points[of] - center), axis=1) < 0, -1.0, 1.0)[:, None]
-        normals, by_cam, by_model = normals * outward, by_cam * outward, by_model * outward
-        bad = ~np.isfinite(normals).all(axis=1) | ~np.isfinite(pixels).all(axis=1)
-        normals[bad], pixels[bad], by_cam[bad], by_model[bad] = 0.0, -1e6, 0.0, [1.0, 0.0, 0.0]
-        gray, corner = _crop(views, int(view), level, pixels[~bad], reach_px + abs(shift_px))
-        offsets, slopes, inside = find_steps(
-            gray, pixels - corner + shift_px * normals, normals, reach_px, HALF_WIDTH_PX, THRESHOLD
-        )
-        size = np.linalg.norm(by_model, axis=1)
-        mm_per_px[of], seen[of] = 1.0 / size, inside
-        if gaps_px is not None:
-            has_rival = np.isfinite(gaps_px[of]).all(axis=1)
-            gap[of[has_rival]] = np.sum(gaps_px[of[has_rival]] * normals[has_rival], axis=1)
-        directions[of] = by_model / size[:, None]
-        hypotheses[of], strengths[of] = offsets / size[:, None], slopes
-        twists[of] = np.concatenate([np.cross(in_cam, by_cam), by_cam], axis=1) / size[:, None]
-    chosen, slope = choose_steps(
-        hypotheses / mm_per_px[:, None], strengths, 0.4 * reach_px, HALF_SLOPE
-    )  # in px, so that the choice does not depend on the distance
-    merged_mm = merged_shift_px(gap, BLUR_PX) * mm_per_px
-    return EdgeOffsets(
-        directions,
-        chosen * mm_per_px,
-        mm_per_px,
-        slopes=slope,
-        seen=seen,
-        hypotheses_mm=hypotheses,
-        strengths=strengths,
-        pose_rows=twists,
-        merged_mm=merged_mm,
-    )
-
-
-def _across(camera: Camera, in_cam: Array, pixels: Array, tangents: Array) -> tuple[Array, Array]:
-    """(N,2) unit normals of edges in the picture, and (N,3) px along them by mm in the camera frame."""
-    by_cam = camera.slopes(in_cam)
-    along = np.einsum("nij,nj->ni", by_cam, tangents)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        along /= np.linalg.norm(along, axis=1, keepdims=True)
-    normals = np.stack([-along[:, 1], along[:, 0]], axis=1)
-    return normals, np.einsum("ni,nij->nj", normals, by_cam)
-
-
-def _crop(
-    views: PhotoViews, view: int, level: int, pixels: Array, reach_px: float
-) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """The part of a photo around some pixels in linear light, and its first pixel (u, v)."""
-    width, height = views.levels[level].sizes[view]
-    margin = reach_px + 12.0
-    low = np.clip(np.floor(pixels.min(axis=0, initial=0.0 if not len(pixels) else np.inf) - margin), 0, [width, height])
-    high = np.clip(np.ceil(pixels.max(axis=0, initial=0.0) + margin), 0, [width, height])
-    first, last = low.astype(np.int64), np.maximum(high, low + 4).astype(np.int64)
-    window = slice(first[1], last[1]), slice(first[0], last[0])
-    whole = views.linear(view, level)
-    part = views.gray(view, level)[window] if whole is None else whole[window]
-    if part.size == 0:
-        return np.zeros((4, 4), dtype=np.float32), np.zeros(2, dtype=np.int64)
-    return linear_light(np.ascontiguousarray(part)) if whole is None else np.ascontiguousarray(part), first
 
 
 def pose_gain(views: PhotoViews, fit: RigidFit, view: NDArray[np.int64], rows: Array) -> Array:
@@ -326,8 +194,10 @@ class ComponentEdges:
             return EdgePoints(apply(step, edges.points), edges.tangents @ step[:3, :3].T, edges.view), gaps_px
         corners = apply(place, self.body.corners)
         points, tangents, views = [], [], []
+        stands = self.views.places.get(self.body.index)
+        moved = None if stands is not None and self.body.is_same(stands, place) else self.body.index
         for view in range(len(self.views.cameras)):
-            window = self.views.window(view, self.body.index, place, corners)
+            window = self.views.window(view, moved, place, corners)
             if window.inverse_depth.size < 9 or not (window.ids == self.body.index).any():
                 continue
             depth = np.zeros(window.inverse_depth.shape, dtype=np.float32)
@@ -405,9 +275,9 @@ class ComponentEdges:
 
     def _support(self, edges: EdgePoints, place: Array) -> float:
         """Share of predicted points with a step within one pixel, beyond what is found by chance beside the edges."""
-        shares = []
+        rays, shares = edge_rays(edges, apply(place, self.body.center), self.views, 0), []
         for shift_px in (0.0, -7.0, 7.0):
-            found = edge_offsets(edges, apply(place, self.body.center), self.views, 3.0, 0, shift_px)
+            found = steps_across(rays, edges.view, self.views, 3.0, 0, shift_px)
             near = found.seen & (found.slopes != 0.0) & (np.abs(found.offsets_mm) < found.mm_per_px)
             shares.append(int(np.count_nonzero(near)) / max(1, int(np.count_nonzero(found.seen))))
         chance = min(0.5 * (shares[1] + shares[2]), 0.9)

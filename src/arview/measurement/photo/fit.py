@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.core.fits import orthogonal_complement, robust_sigma, tukey_weights
+from arview.core.fits import TUKEY_SIGMAS, orthogonal_complement, robust_sigma
 from arview.core.kernel import kernel
 from arview.geometry import Array
 
@@ -82,7 +82,7 @@ def fit_rigid(
     scaled = rows * scale
     white = scaled / sigmas[:, None]
     basis = _observable_directions(white, orthogonal_complement(free).T, undetermined_mm)
-    solution, residuals, weights = _reweighted(white, offsets / sigmas, basis, min_sigma)
+    solution, residuals, weights = _reweighted(white, offsets / sigmas, np.ascontiguousarray(basis), min_sigma)
     weighted = white @ basis * weights[:, None]
     inverse = np.linalg.pinv(weighted.T @ (white @ basis), hermitian=True)
     gain = (basis @ inverse @ weighted.T) / sigmas  # of the scaled twist
@@ -125,20 +125,51 @@ def _observable_directions(white: Array, allowed: Array, undetermined_mm: float)
     return allowed @ vectors[:, is_held]
 
 
-def _reweighted(white: Array, target: Array, basis: Array, min_sigma: float) -> tuple[Array, Array, Array]:
+@kernel
+def _reweighted(
+    white: NDArray[np.float64], target: NDArray[np.float64], basis: NDArray[np.float64], min_sigma: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Iteratively reweighted least squares: solution (6,), normalised residuals (N,) and weights (N,)."""
-    weights = np.ones(len(white))
-    solution, residuals = np.zeros(6), target
+    count, free = len(white), basis.shape[1]
+    inner = np.zeros((count, free))
+    for i in range(count):
+        for a in range(free):
+            for k in range(6):
+                inner[i, a] += white[i, k] * basis[k, a]
+    weights, residuals, sizes = np.ones(count), target.copy(), np.empty(count)
+    solution = np.zeros(free)
     for _ in range(_MAX_ITERATIONS):
-        weighted = white @ basis * weights[:, None]
-        normal = weighted.T @ (white @ basis)
-        solution, last = basis @ np.linalg.pinv(normal, hermitian=True) @ (weighted.T @ target), solution
-        residuals = target - white @ solution
-        spread = max(min_sigma, robust_sigma(residuals))
-        weights = tukey_weights(residuals / spread)
-        if np.abs(solution - last).max() < 1e-6:
+        normal, right = np.zeros((free, free)), np.zeros(free)
+        for i in range(count):
+            if weights[i] == 0.0:
+                continue
+            for a in range(free):
+                weighted = weights[i] * inner[i, a]
+                right[a] += weighted * target[i]
+                for b in range(a + 1):
+                    normal[a, b] += weighted * inner[i, b]
+        for a in range(free):
+            for b in range(a):
+                normal[b, a] = normal[a, b]
+        step_square = 0.0
+        if free > 0:
+            moved = np.linalg.pinv(normal) @ right
+            step_square = np.sum((moved - solution) ** 2)
+            solution = moved
+        for i in range(count):
+            left = target[i]
+            for a in range(free):
+                left -= inner[i, a] * solution[a]
+            residuals[i], sizes[i] = left, abs(left)
+        limit = TUKEY_SIGMAS * max(min_sigma, 1.4826 * np.median(sizes))
+        for i in range(count):
+            weights[i] = max(0.0, 1.0 - (sizes[i] / limit) ** 2) ** 2
+        if step_square < 1e-12:
             break
-    return solution, residuals, weights
+    whole = np.zeros(6)
+    for a in range(free):
+        whole += basis[:, a] * solution[a]
+    return whole, residuals, weights
 
 
 def _support(rows: Array, weights: Array, searched: Array, basis: Array) -> tuple[Array, Array]:
@@ -185,9 +216,9 @@ def _distance_bins(places: NDArray[np.float64], edges: NDArray[np.float64]) -> N
             square = 0.0
             for k in range(d):
                 square += (places[i, k] - places[j, k]) ** 2
-            b = 0
-            while b < len(edges) and square > edges[b] * edges[b]:
-                b += 1
+            b = len(edges)  # from the farthest, because most pairs are far apart
+            while b > 0 and square <= edges[b - 1] * edges[b - 1]:
+                b -= 1
             bins[i, j] = bins[j, i] = b
     return bins
 
@@ -214,11 +245,12 @@ def _correlated_sum(
     result = np.zeros((b, b))
     for i in range(n):
         mixed = np.zeros(b)
-        for j in range(n):
-            if j != i and correlation[bins[i, j]] > 0.0:
+        for j in range(i):
+            share = correlation[bins[i, j]]
+            if share > 0.0:
                 for k in range(b):
-                    mixed[k] += correlation[bins[i, j]] * rows[j, k]
+                    mixed[k] += share * rows[j, k]
         for a in range(b):
             for k in range(b):
                 result[a, k] += rows[i, a] * mixed[k]
-    return result
+    return result + result.T

@@ -76,6 +76,7 @@ def measure_components_in_photos(
         names = names or [name for name in part.inspected if name in known] if part is not None else names
     indices = [model.index(name) for name in names]
     near = {model.index(name): place for name, place in (starts or {}).items()}
+    views = views.standing(near)
     results: dict[str, MethodResults] = {}
     jobs = [
         (index, pool().submit(measure_component, views, index, part, methods, near.get(index))) for index in indices

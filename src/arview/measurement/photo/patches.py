@@ -76,10 +76,15 @@ def face_normals(component: Component) -> Array:
 def near_others(points: Array, model: Model, component: int, reach_mm: float) -> NDArray[np.bool_]:
     """(N,) which points (N,3) are within ``reach_mm`` of the surface of any other component."""
     result = np.zeros(len(points), dtype=np.bool_)
-    for index, other in enumerate(model.components):
+    if not len(points):
+        return result
+    bounds = np.stack([other.bounds_in_model for other in model.components])
+    touches = (bounds[:, 0] <= points.max(axis=0) + reach_mm) & (bounds[:, 1] >= points.min(axis=0) - reach_mm)
+    for index in np.flatnonzero(touches.all(axis=1)):
         if index == component:
             continue
-        low, high = other.bounds_in_model[0] - reach_mm, other.bounds_in_model[1] + reach_mm
+        other = model.components[index]
+        low, high = bounds[index, 0] - reach_mm, bounds[index, 1] + reach_mm
         (near,) = np.nonzero(~result & ((points >= low) & (points <= high)).all(axis=1))
         if len(near) == 0:
             continue

@@ -7,8 +7,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from arview.geometry import Array, apply
+from arview.core.kernel import kernel
+from arview.core.subpixel_edges import project_edges
+from arview.geometry import Array
 from arview.measurement.photo.views import PhotoViews
+
+MAX_ALONG_PX = 2.5
+"""Points farther apart than this along an edge are not beside each other."""
+MIN_PARALLEL = 0.8
+"""Cosine of the angle between edges that run beside each other."""
 
 
 @dataclass(frozen=True)
@@ -39,52 +46,42 @@ def rival_offsets_px(edges: EdgePoints, views: PhotoViews, reach_px: float, same
         reach_px: distance within which another edge is looked for.
         same_px: points nearer than this across the edge are on the same line in the photo, and no rivals.
     """
-    from scipy.spatial import cKDTree
-
-    result = np.full((len(edges.points), 2), np.inf)
-    for view in np.unique(edges.view):
-        of = np.flatnonzero(edges.view == view)
-        camera, pose = views.cameras[view], views.cam_from_model[view]
-        in_cam = apply(pose, edges.points[of])
-        pixels = camera.project(in_cam)
-        onward = camera.project(in_cam + 1e-4 * in_cam[:, 2:] * (edges.tangents[of] @ pose[:3, :3].T))
-        along = onward - pixels
-        with np.errstate(invalid="ignore", divide="ignore"):
-            along = along / np.linalg.norm(along, axis=1, keepdims=True)
-        good = np.isfinite(pixels).all(axis=1) & np.isfinite(along).all(axis=1)
-        if np.count_nonzero(good) < 2:
-            continue
-        pairs = cKDTree(pixels[good]).query_pairs(reach_px + 2.0, output_type="ndarray")
-        if not len(pairs):
-            continue
-        index = np.flatnonzero(good)
-        first, second = index[pairs[:, 0]], index[pairs[:, 1]]
-        _note(result, of, first, second=second, pixels=pixels, along=along, reach_px=reach_px, same_px=same_px)
-        _note(result, of, second, second=first, pixels=pixels, along=along, reach_px=reach_px, same_px=same_px)
-    return result
+    stack = views.levels[0]
+    _, pixels, normals, _ = project_edges(edges.points, edges.tangents, edges.view, stack.poses, stack.lenses)
+    with np.errstate(invalid="ignore"):
+        order = np.lexsort((pixels[:, 0], edges.view))
+    return _nearest_beside(order, edges.view, pixels, normals, reach_px, same_px)
 
 
-def _note(
-    result: Array,
-    of: NDArray[np.int64],
-    first: NDArray[np.int64],
-    second: NDArray[np.int64],
-    pixels: Array,
-    along: Array,
+@kernel
+def _nearest_beside(
+    order: NDArray[np.int64],
+    view: NDArray[np.int64],
+    pixels: NDArray[np.float64],
+    normals: NDArray[np.float64],
     reach_px: float,
     same_px: float,
-) -> None:
-    """Take over the offsets of the first points of pairs where the second ones are on a nearer edge beside theirs."""
-    apart = pixels[second] - pixels[first]
-    normal = np.stack([-along[first, 1], along[first, 0]], axis=1)
-    signed = np.sum(normal * apart, axis=1)
-    across, onward = np.abs(signed), np.abs(np.sum(along[first] * apart, axis=1))
-    parallel = np.abs(np.sum(along[first] * along[second], axis=1)) > 0.8
-    beside = parallel & (onward < 2.5) & (across > same_px) & (across < reach_px)
-    beside &= across < np.hypot(*result[of[first]].T)
-    # The nearest is written last.
-    order = np.flatnonzero(beside)[np.argsort(-across[beside], kind="stable")]
-    result[of[first[order]]] = normal[order] * signed[order, None]
+) -> NDArray[np.float64]:
+    """`rival_offsets_px` of points in ``order`` by view and column; those that are NaN have none, and are nobody's."""
+    count = len(order)
+    result, nearest = np.full((count, 2), np.inf), np.full(count, reach_px)
+    window_px = reach_px + MAX_ALONG_PX
+    for a in range(count):
+        i = order[a]
+        for b in range(a + 1, count):
+            j = order[b]
+            du, dv = pixels[j, 0] - pixels[i, 0], pixels[j, 1] - pixels[i, 1]
+            if view[j] != view[i] or not du <= window_px:
+                break
+            if abs(normals[i, 0] * normals[j, 0] + normals[i, 1] * normals[j, 1]) <= MIN_PARALLEL:
+                continue
+            for k, sign in ((i, 1.0), (j, -1.0)):
+                across = sign * (normals[k, 0] * du + normals[k, 1] * dv)
+                along = abs(normals[k, 1] * du - normals[k, 0] * dv)
+                if along < MAX_ALONG_PX and same_px < abs(across) < nearest[k]:
+                    nearest[k] = abs(across)
+                    result[k, 0], result[k, 1] = across * normals[k, 0], across * normals[k, 1]
+    return result
 
 
 def merged_shift_px(gap_px: Array, blur_px: float) -> Array:

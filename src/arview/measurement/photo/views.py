@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -22,6 +23,8 @@ from arview.rendering import rasterise
 
 MAX_LINEAR_PX = 24_000_000
 """Pixels of all photos up to which they are kept in linear light too: 130 MB with their reduced sizes."""
+SCENE_MARGIN_PX = 60
+"""Drawn around the model: components may stand that far outside its bounding box."""
 
 
 class PhotoStack(NamedTuple):
@@ -57,6 +60,14 @@ class RenderedWindow(NamedTuple):
     inverse_depth: Array
     ids: NDArray[np.int32]
 
+    def cropped(self, origin: tuple[int, int], width: int, height: int) -> RenderedWindow | None:
+        """A smaller window; None: it is not within this one."""
+        column, row = origin[0] - self.origin[0], origin[1] - self.origin[1]
+        if min(column, row) < 0 or row + height > self.ids.shape[0] or column + width > self.ids.shape[1]:
+            return None
+        part = slice(row, row + height), slice(column, column + width)
+        return RenderedWindow(self.lens, origin, self.inverse_depth[part].astype(np.float64), self.ids[part])
+
 
 @dataclass(frozen=True)
 class PhotoViews:
@@ -69,6 +80,8 @@ class PhotoViews:
         cam_from_model: (M,4,4).
         levels: the photos at full, half and quarter size.
         pose_covariance: see `SparseModel`; None when unknown.
+        places: (4,4) measured_from_nominal of components that stand there, by index; others are at nominal.
+        scenes: the photos with all components where they stand, see `standing`; empty without.
     """
 
     model: Model
@@ -77,6 +90,9 @@ class PhotoViews:
     cam_from_model: Array
     levels: tuple[PhotoStack, ...]
     pose_covariance: Array | None = None
+    places: Mapping[int, Array] = field(default_factory=dict)
+    scenes: tuple[RenderedWindow, ...] = ()
+    _linear: dict[tuple[int, int], NDArray[np.float32]] = field(default_factory=dict, repr=False)
 
     @property
     def centres(self) -> Array:
@@ -98,8 +114,28 @@ class PhotoViews:
         return self._linear[view, level]
 
     @cached_property
-    def _linear(self) -> dict[tuple[int, int], NDArray[np.float32]]:
-        return {}
+    def _vertices(self) -> Array:
+        """(V,3) vertices of the model with its components where they stand."""
+        vertices, faces, owner = self.model.mesh
+        vertices = vertices.copy()
+        for component, place in self.places.items():
+            mine = np.unique(faces[owner == component])
+            vertices[mine] = apply(place, vertices[mine])
+        return vertices
+
+    def standing(self, places: Mapping[int, Array]) -> PhotoViews:
+        """The same photos with components at ``places``; few enough photos are drawn so, once for all components."""
+        views = replace(self, places=places)
+        if not places or len(self.levels[0].pixels) > MAX_LINEAR_PX:
+            return views
+        low, high = self.model.bounds_in_model
+        corners = low + np.array(list(np.ndindex(2, 2, 2))) * (high - low)
+
+        def drawn(view: int) -> RenderedWindow:
+            window = views.window(view, None, np.eye(4), corners, SCENE_MARGIN_PX)
+            return window._replace(inverse_depth=window.inverse_depth.astype(np.float32))
+
+        return replace(views, scenes=tuple(pool().map(drawn, range(len(self.cameras)))))
 
     def mm_per_px(self, point: Array) -> float:
         """Size of a pixel at a point (3,): median over the photos in front of which it lies.
@@ -120,17 +156,18 @@ class PhotoViews:
 
         Args:
             view: index of the photo.
-            component: index of the component that stands at ``place``; None renders all at nominal; ``-1 - i`` removes
-                component i.
+            component: index of the component that stands at ``place``; None: all are where they stand; ``-1 - i``
+                removes component i.
             place: (4,4) measured_from_nominal.
             around: (N,3) points that the window must contain, mm.
             margin_px: added on every side.
         """
         camera, pose = self.cameras[view], self.cam_from_model[view]
-        vertices, faces, owner = self.model.mesh
+        nominal, faces, owner = self.model.mesh
+        vertices = self._vertices
         if component is not None and component >= 0:
             mine, vertices = np.unique(faces[owner == component]), vertices.copy()
-            vertices[mine] = apply(place, vertices[mine])
+            vertices[mine] = apply(place, nominal[mine])
         elif component is not None:
             faces, owner = faces[owner != -1 - component], owner[owner != -1 - component]
         pixels = camera.without_distortion().project(apply(pose, around))
@@ -143,6 +180,9 @@ class PhotoViews:
         width, height = (int(v) for v in np.maximum(high - low, 1))
         lens = (camera.fx, camera.fy, camera.cx, camera.cy)
         origin = (int(low[0]), int(low[1]))
+        drawn = self.scenes[view].cropped(origin, width, height) if component is None and self.scenes else None
+        if drawn is not None:
+            return drawn
         inverse_depth, face = rasterise(apply(pose, vertices), faces, *lens, width, height, origin=origin)
         return RenderedWindow(lens, origin, inverse_depth, np.where(face >= 0, owner[np.maximum(face, 0)], -1))
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -277,9 +278,12 @@ def _draw(contributions: Sequence[Contribution], options: UncertaintyOptions, sa
     """(D,K) sums of draws of all contributions: normal, or rectangular along the principal axes."""
     normal = np.sum([one.covariance for one in contributions if not one.is_bounded], axis=0)
     bounded = [one.covariance for one in contributions if one.is_bounded]
-    rng = np.random.default_rng([options.seed, salt])
-    total = np.zeros((options.draws, len(normal)))
-    for index, covariance in enumerate([normal, *bounded]):
-        noise = rng.standard_normal(total.shape) if index == 0 else rng.uniform(-_BOUND, _BOUND, total.shape)
-        total += noise @ covariance_root(covariance).T
-    return total
+    draws = _standard_draws(options.seed, salt, (options.draws, len(normal)), 1 + len(bounded))
+    return np.asarray(sum(noise @ covariance_root(one).T for noise, one in zip(draws, [normal, *bounded], strict=True)))
+
+
+@lru_cache(maxsize=4)
+def _standard_draws(seed: int, salt: int, shape: tuple[int, int], count: int) -> tuple[Array, ...]:
+    """Normal draws with unit variance, then ``count - 1`` times rectangular ones: the same for all components."""
+    rng = np.random.default_rng([seed, salt])
+    return (rng.standard_normal(shape), *(rng.uniform(-_BOUND, _BOUND, shape) for _ in range(count - 1)))

@@ -18,7 +18,7 @@ from arview.cad import Model
 from arview.camera import Camera
 from arview.core.fits import robust_sigma, tukey_weights
 from arview.core.parallel import pool
-from arview.core.subpixel_edges import choose_steps, find_steps
+from arview.core.subpixel_edges import choose_steps, find_steps, project_edges
 from arview.geometry import Array, apply
 from arview.reconstruction.scale.similarity import Similarity
 from arview.rendering import EDGE_SHARP, EDGE_SILHOUETTE, ZBufferRenderer, sample_visible_edges
@@ -62,6 +62,8 @@ MIN_SIGMA_PX = 0.1
 """Lower bound of the residuals' standard deviation: lens, tessellation, pixel response."""
 NEAR_PX = 1.5
 """Distance up to which a step supports an edge."""
+CLEAR_BASE = 0.9
+"""Mean share of the base's edges that the others cannot have pulled away from it."""
 BESIDE_PX = 9.0
 """Distance beside the edges at which chance is measured."""
 DARK_SHIFT_PX = 0.1
@@ -180,8 +182,8 @@ class JointRefiner:
         rendering = ZBufferRenderer(self.model, drawn).render(cam_from_model)
         lens = (drawn.fx, drawn.fy, drawn.cx, drawn.cy)
         found = sample_visible_edges(self._edges, cam_from_model, lens, rendering.depth_mm, SPACING_PX * shrink)
-        depth = apply(cam_from_model, found.points_in_model)[:, 2]
-        normals = self._normals(drawn, cam_from_model, found.points_in_model, found.tangents_in_model)
+        in_cam, _, normals, _ = _projected(drawn, cam_from_model, found.points_in_model, found.tangents_in_model)
+        depth = in_cam[:, 2]
         is_good = (found.kinds & (EDGE_SHARP | EDGE_SILHOUETTE)) > 0
         for side in (-CONTACT_PX, CONTACT_PX):
             u, v = np.round(found.pixels + side * normals).astype(np.intp).T
@@ -204,7 +206,7 @@ class JointRefiner:
         for components in (np.ones_like(self._is_base), self._is_base):
             fit = self.refine(start, ROUGH_REACHES_PX, components)
             tried.append((fit.similarity, self.support(fit.similarity)))
-            if self._is_base.all():
+            if self._is_base.all() or tried[0][1].base_score > CLEAR_BASE:
                 break
         return max(tried, key=lambda pair: pair[1].base_score)
 
@@ -270,15 +272,12 @@ class JointRefiner:
 
         With ``shift_px`` the search is beside the edges, where steps are found by chance.
         """
-        in_cam = apply(cam_from_model, samples.points)
-        pixels = view.camera.project(in_cam)
-        normals = self._normals(view.camera, cam_from_model, samples.points, samples.tangents)
+        _, pixels, normals, by_cam = _projected(view.camera, cam_from_model, samples.points, samples.tangents)
         all_offsets, all_slopes, seen = find_steps(
             view.gray, pixels + shift_px * normals, normals, reach_px, HALF_WIDTH_PX, THRESHOLD
         )
         offsets, slopes = choose_steps(all_offsets, all_slopes, 0.4 * reach_px, HALF_SLOPE)
         is_found = seen & (slopes != 0.0)
-        by_cam = np.einsum("ni,nij->nj", normals, view.camera.slopes(in_cam))
         by_model = by_cam @ cam_from_model[:3, :3]
         rows = np.concatenate(
             [
@@ -318,16 +317,6 @@ class JointRefiner:
 
         return list(pool().map(one, self.views))
 
-    @staticmethod
-    def _normals(camera: Camera, cam_from_model: Array, points: Array, tangents: Array) -> Array:
-        """(N,2) unit normals of the edges in the picture."""
-        in_cam = apply(cam_from_model, points)
-        along = camera.project(in_cam + 1e-4 * in_cam[:, 2:] * (tangents @ cam_from_model[:3, :3].T))
-        along -= camera.project(in_cam)
-        with np.errstate(invalid="ignore"):
-            along /= np.linalg.norm(along, axis=1, keepdims=True)
-        return np.asarray(np.stack([-along[:, 1], along[:, 0]], axis=1))
-
     def _features(self, points: Array, tangents: Array, component: NDArray[np.int32]) -> NDArray[np.int64]:
         """(N,) one number for all points of a component on the same straight line, whose errors are correlated."""
         sign = np.sign(np.take_along_axis(tangents, np.argmax(np.abs(tangents), axis=1)[:, None], axis=1))
@@ -336,6 +325,14 @@ class JointRefiner:
         place = np.round(foot / (0.02 * self.model.diameter_mm)).astype(np.int64)
         key = np.concatenate([component[:, None], direction, place], axis=1)
         return np.asarray(key @ np.array([1, 7, 67, 641, 6113, 1000003, 160005571], dtype=np.int64))
+
+
+def _projected(
+    camera: Camera, cam_from_model: Array, points: Array, tangents: Array
+) -> tuple[Array, Array, Array, Array]:
+    """`project_edges` of one camera."""
+    lens = np.array([[camera.fx, camera.fy, camera.cx, camera.cy, *camera.dist]])
+    return project_edges(points, tangents, np.zeros(len(points), dtype=np.int64), cam_from_model[None, :3], lens)
 
 
 def _mean(values: Array) -> float:
@@ -347,11 +344,15 @@ class _JointSystem:
     """Equations of one round: 8 common unknowns, and 3 for each component that may be displaced."""
 
     def __init__(self, measured: Sequence[EdgeResiduals], displacements: Array, is_base: NDArray[np.bool_]) -> None:
-        self.rows = np.concatenate([m.rows for m in measured])
-        self.offsets = np.concatenate([m.offsets for m in measured])
-        self.component = np.concatenate([m.component for m in measured])
-        self.feature = np.concatenate([m.feature for m in measured])
-        self.view = np.repeat(np.arange(len(measured)), [len(m.offsets) for m in measured])
+        component = np.concatenate([m.component for m in measured])
+        order = np.argsort(component, kind="stable")
+        self.component = component[order]
+        ends = np.cumsum(np.bincount(component, minlength=len(is_base)))
+        self.of = [slice(start, end) for start, end in zip([0, *ends[:-1]], ends, strict=True)]
+        self.rows = np.concatenate([m.rows for m in measured])[order]
+        self.offsets = np.concatenate([m.offsets for m in measured])[order]
+        self.feature = np.concatenate([m.feature for m in measured])[order]
+        self.view = np.repeat(np.arange(len(measured)), [len(m.offsets) for m in measured])[order]
         self.is_base = is_base
         # Residuals with each component at the place that the previous round found.
         left = self.offsets - np.sum(self.rows[:, 3:6] * displacements[self.component], axis=1)
@@ -370,8 +371,7 @@ class _JointSystem:
         hessian[7, 7] += self.dark_prior
         reduced, right = hessian.copy(), gradient.copy()
         own = {}
-        for index in range(len(self.is_base)):
-            of = self.component == index
+        for index, of in enumerate(self.of):
             mixed = weighted[of].T @ self.rows[of, 3:6]
             inner = np.linalg.inv(mixed[3:6] + self.prior[index] * np.eye(3))
             pull = weighted[of, 3:6].T @ self.offsets[of]
@@ -384,8 +384,7 @@ class _JointSystem:
         self.projected = self.rows.copy()
         for index, (mixed, inner, pull) in own.items():
             displacements[index] = inner @ (pull - mixed.T @ solution)
-            of = self.component == index
-            self.projected[of] -= self.rows[of, 3:6] @ inner @ mixed.T
+            self.projected[self.of[index]] -= self.rows[self.of[index], 3:6] @ inner @ mixed.T
         self.left = self.offsets - self.rows @ solution - np.sum(self.rows[:, 3:6] * displacements[self.component], 1)
         return solution[:7], displacements
 
