@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arview.camera import Camera
-from arview.core.subpixel_edges import choose_steps, find_steps, linear_light
+from arview.core import subpixel_edges
 from arview.fiducials.board import Board, cv_board, cv_dictionary
 from arview.geometry import Array
 
@@ -57,7 +57,7 @@ def find_corners(
     import cv2
 
     found: dict[CornerKey, Array] = {}
-    light = linear_light(gray)
+    light = subpixel_edges.linear_light(gray)
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
     for number, board in enumerate(boards):
@@ -94,8 +94,8 @@ def refined_quad(light: NDArray[np.float32], camera: Camera, quad: Array) -> Arr
         count = int(np.clip(np.linalg.norm(b - a) / SPACING_PX, *SAMPLE_RANGE))
         points = a + np.linspace(*SIDE_RANGE, count)[:, None] * (b - a)
         normals = np.tile(normal, (count, 1))
-        offsets, slopes, _ = find_steps(light, points, normals, REACH_PX, HALF_WIDTH_PX, THRESHOLD)
-        offset, slope = choose_steps(offsets, slopes, 0.5 * REACH_PX, HALF_SLOPE)
+        offsets, slopes, _ = subpixel_edges.find_steps(light, points, normals, REACH_PX, HALF_WIDTH_PX, THRESHOLD)
+        offset, slope = subpixel_edges.choose_steps(offsets, slopes, 0.5 * REACH_PX, HALF_SLOPE)
         is_found = slope != 0.0
         is_found &= np.abs(offset - np.median(offset[is_found])) < MAX_DEVIATION_PX if is_found.any() else False
         if np.count_nonzero(is_found) < MIN_SAMPLES:

@@ -70,6 +70,11 @@ MAX_ERROR_PX = 2.0
 """Observations with larger errors are left out of the last adjustment."""
 LAST_TOLERANCE = 1e-5
 """Relative decrease of the cost at which the last adjustment ends."""
+MAPPING_TOLERANCES = {"ba_global_function_tolerance": 1e-4, "ba_local_function_tolerance": 1e-3}
+"""Relative decrease of the cost at which the adjustments of the first pass end, whose poses only have to be good enough
+to match along epipolar lines."""
+TRIANGULATION_ROUNDS = 1
+"""Adjustments of the points alone while they are triangulated; poses and points are adjusted together afterwards."""
 MIN_ANGLE_DEG = 1.5
 """Angle between two rays to a point; smaller ones do not determine depth."""
 
@@ -318,7 +323,7 @@ def _map(path: Path, folder: Path, options: SparseOptions, photo_count: int, tel
     # In one thread, because with several COLMAP starts from whichever good pair is found first, which varies between
     # runs. Threads would save no time here: the small adjustments run in one thread anyway.
     mapping = pycolmap.IncrementalPipelineOptions(
-        random_seed=options.seed, min_model_size=3, extract_colors=False, num_threads=1
+        random_seed=options.seed, min_model_size=3, extract_colors=False, num_threads=1, **MAPPING_TOLERANCES
     )
     with pycolmap.Database.open(str(path)) as database:
         cameras = database.read_all_cameras()
@@ -416,6 +421,7 @@ def triangulate_and_adjust(
     tell("adjusting", 0, 3)
     triangulation = pycolmap.IncrementalPipelineOptions(random_seed=options.seed, num_threads=threads)
     triangulation.triangulation.ignore_two_view_tracks = False
+    triangulation.ba_global_max_refinements = TRIANGULATION_ROUNDS
     model = pycolmap.triangulate_points(
         model, str(path), str(folder), str(emptied(folder / "triangulated")), True, triangulation
     )

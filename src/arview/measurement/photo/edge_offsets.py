@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from arview.core import subpixel_edges
 from arview.core.kernel import kernel
-from arview.core.subpixel_edges import choose_steps, find_steps, linear_light, project_edges
 from arview.geometry import Array
 from arview.measurement.photo.rival_edges import EdgePoints, merged_shift_px
 from arview.measurement.photo.views import PhotoViews
@@ -76,7 +76,9 @@ def edge_offsets(
 def edge_rays(edges: EdgePoints, center: Array, views: PhotoViews, level: int) -> EdgeRays:
     """Edge points in the photos, with directions that lead away from a point (3,)."""
     stack = views.levels[level]
-    in_cam, pixels, normals, by_cam = project_edges(edges.points, edges.tangents, edges.view, stack.poses, stack.lenses)
+    in_cam, pixels, normals, by_cam = subpixel_edges.project_edges(
+        edges.points, edges.tangents, edges.view, stack.poses, stack.lenses
+    )
     return EdgeRays(
         pixels, normals, *_outward(edges.points, edges.view, stack.poses, np.asarray(center), in_cam, normals, by_cam)
     )
@@ -99,8 +101,10 @@ def steps_across(
         pixels, normals = rays.pixels[of], rays.normals[of]
         light, corner = _crop(views, int(v), level, pixels, reach_px + abs(shift_px))
         pixels += shift_px * normals - corner
-        hypotheses[of], strengths[of], seen[of] = find_steps(light, pixels, normals, reach_px, HALF_WIDTH_PX, THRESHOLD)
-    chosen, slopes = choose_steps(hypotheses, strengths, 0.4 * reach_px, HALF_SLOPE)
+        hypotheses[of], strengths[of], seen[of] = subpixel_edges.find_steps(
+            light, pixels, normals, reach_px, HALF_WIDTH_PX, THRESHOLD
+        )
+    chosen, slopes = subpixel_edges.choose_steps(hypotheses, strengths, 0.4 * reach_px, HALF_SLOPE)
     gap = np.full(n, np.inf)
     if gaps_px is not None:
         has_rival = np.isfinite(gaps_px).all(axis=1)
@@ -186,4 +190,4 @@ def _crop(
     part = views.gray(view, level)[first[1] : last[1], first[0] : last[0]]
     if part.size == 0:
         return np.zeros((4, 4), dtype=np.float32), np.zeros(2, dtype=np.int64)
-    return linear_light(np.ascontiguousarray(part)), first
+    return subpixel_edges.linear_light(np.ascontiguousarray(part)), first

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from arview.core import subpixel_edges
 from arview.core.kernel import kernel
-from arview.core.subpixel_edges import project_edges
 from arview.geometry import Array
 from arview.measurement.photo.views import PhotoViews
 
@@ -47,7 +47,9 @@ def rival_offsets_px(edges: EdgePoints, views: PhotoViews, reach_px: float, same
         same_px: points nearer than this across the edge are on the same line in the photo, and no rivals.
     """
     stack = views.levels[0]
-    _, pixels, normals, _ = project_edges(edges.points, edges.tangents, edges.view, stack.poses, stack.lenses)
+    _, pixels, normals, _ = subpixel_edges.project_edges(
+        edges.points, edges.tangents, edges.view, stack.poses, stack.lenses
+    )
     with np.errstate(invalid="ignore"):
         order = np.lexsort((pixels[:, 0], edges.view))
     return _nearest_beside(order, edges.view, pixels, normals, reach_px, same_px)

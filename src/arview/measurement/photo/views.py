@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from arview.cad import Model
 from arview.camera import Camera
+from arview.core import subpixel_edges
 from arview.core.kernel import kernel
 from arview.core.parallel import pool
-from arview.core.subpixel_edges import linear_light
 from arview.errors import InputError
 from arview.geometry import Array, apply
 from arview.reconstruction import SparseModel
@@ -110,7 +110,7 @@ class PhotoViews:
         if len(self.levels[0].pixels) > MAX_LINEAR_PX:
             return None
         if (view, level) not in self._linear:
-            self._linear[view, level] = linear_light(np.ascontiguousarray(self.gray(view, level)))
+            self._linear[view, level] = subpixel_edges.linear_light(np.ascontiguousarray(self.gray(view, level)))
         return self._linear[view, level]
 
     @cached_property

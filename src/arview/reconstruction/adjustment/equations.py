@@ -11,12 +11,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
-import scipy.sparse
 from numpy.typing import NDArray
 
 from arview.camera import Camera
+from arview.core.kernel import kernel
 from arview.geometry import Array, apply, exp_se3
 from arview.reconstruction.adjustment.covariance import (
     LOSS_PX,
@@ -62,6 +63,32 @@ class LensTerms:
     has_centre: bool
 
 
+class PointRows(NamedTuple):
+    """Equations of the observations, by which the points follow the other unknowns.
+
+    Attributes:
+        point: (K,) index of the point.
+        by_point, by_photo, columns: (K,2,3) and (K,2,C) weighed derivatives, the second by the unknowns (K,C).
+        weighed: (K,2) residuals.
+        inverse: (N,3,3) inverse information of each point.
+    """
+
+    point: NDArray[np.int32]
+    by_point: Array
+    by_photo: Array
+    columns: NDArray[np.int64]
+    weighed: Array
+    inverse: Array
+
+    def shifts(self, step: Array) -> Array:
+        """(N,3) shifts of the points after a step (U,) of the other unknowns."""
+        left = self.weighed - np.einsum("kpc,kc->kp", self.by_photo, step[self.columns])
+        pulls = np.einsum("kpi,kp->ki", self.by_point, left)
+        count = len(self.inverse)
+        total = np.stack([np.bincount(self.point, pulls[:, axis], count) for axis in range(3)], axis=1)
+        return np.einsum("nij,nj->ni", self.inverse, total)
+
+
 @dataclass(frozen=True)
 class NormalEquations:
     """Equations of an adjustment with its points eliminated.
@@ -69,12 +96,12 @@ class NormalEquations:
     Attributes:
         matrix: (U,U) of the unknowns: `UNKNOWNS` of each photo, then those of each common lens.
         right: (U,).
-        carry: for the points: (3N,U) sparse, their change by one of the other unknowns, and (3N,) by their own pull.
+        rows: by which the points follow.
     """
 
     matrix: Array
     right: Array
-    carry: tuple[scipy.sparse.csr_matrix, Array]
+    rows: PointRows
 
 
 def lens_slopes(camera: Camera, in_cam: Array, pixels: Array) -> Array:
@@ -114,31 +141,86 @@ def normal_equations(sparse: SparseModel, terms: LensTerms) -> NormalEquations:
         if terms.lens[index] >= 0:
             by_lens[of] = lens
             by_lens[of, :, 1:3] *= terms.has_centre
-    columns = UNKNOWNS * sparse.observed_photo[:, None] + np.arange(UNKNOWNS)
+    columns = UNKNOWNS * sparse.observed_photo[:, None].astype(np.int64) + np.arange(UNKNOWNS)
     own = UNKNOWNS * photos + 5 * np.maximum(terms.lens[sparse.observed_photo], 0)[:, None] + np.arange(5)
     if common:
         columns, by_photo = np.concatenate([columns, own], axis=1), np.concatenate([by_photo, by_lens], axis=2)
-    cameras = _rows(by_photo, columns, width)
-    points = _rows(by_point, 3 * sparse.observed_point[:, None] + np.arange(3), 3 * count)
-    weighed = (roots[:, None] * residuals).ravel()
-    blocks = np.zeros((count, 3, 3))
-    np.add.at(blocks, sparse.observed_point, np.einsum("kpi,kpj->kij", by_point, by_point))
-    inverse = scipy.sparse.bsr_matrix(
-        (np.linalg.pinv(blocks, hermitian=True), np.arange(count), np.arange(count + 1)), shape=(3 * count, 3 * count)
-    )
-    mixed = (points.T @ cameras).tocsr()
-    solved = (inverse @ mixed).tocsr()
-    pull = inverse @ (points.T @ weighed)
-    matrix = (cameras.T @ cameras - mixed.T @ solved).toarray()
-    return NormalEquations(matrix, cameras.T @ weighed - mixed.T @ pull, (solved, pull))
+    weighed = roots[:, None] * residuals
+    order = np.argsort(sparse.observed_point, kind="stable")
+    ends = np.cumsum(np.bincount(sparse.observed_point, minlength=count))
+    inverse: Array = np.asarray(np.linalg.pinv(_point_blocks(order, ends, by_point), hermitian=True), np.float64)
+    matrix, right = _without_points(order, ends, by_point, by_photo, columns, weighed, inverse, width)
+    rows = PointRows(sparse.observed_point, by_point, by_photo, columns, weighed, inverse)
+    return NormalEquations(matrix, right, rows)
 
 
-def _rows(blocks: Array, columns: NDArray[np.int64], width: int) -> scipy.sparse.csr_matrix:
-    """Sparse matrix of the derivatives (K,2,C) of observations, by the unknowns (K,C)."""
-    count, _, size = blocks.shape
-    starts = np.arange(0, 2 * count * size + 1, size)
-    indices = np.repeat(columns[:, None], 2, axis=1).ravel()
-    return scipy.sparse.csr_matrix((blocks.ravel(), indices, starts), shape=(2 * count, width))
+@kernel
+def _point_blocks(
+    order: NDArray[np.int64], ends: NDArray[np.int64], by_point: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """(N,3,3) information of each point by its observations, which are those of ``order`` up to its end."""
+    blocks = np.zeros((len(ends), 3, 3))
+    for n in range(len(ends)):
+        for at in range(ends[n - 1] if n else 0, ends[n]):
+            rows = by_point[order[at]]
+            for i in range(3):
+                for j in range(3):
+                    blocks[n, i, j] += rows[0, i] * rows[0, j] + rows[1, i] * rows[1, j]
+    return blocks
+
+
+@kernel
+def _without_points(
+    order: NDArray[np.int64],
+    ends: NDArray[np.int64],
+    by_point: NDArray[np.float64],
+    by_photo: NDArray[np.float64],
+    columns: NDArray[np.int64],
+    weighed: NDArray[np.float64],
+    inverse: NDArray[np.float64],
+    width: int,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Matrix (U,U) and right side (U,) of the other unknowns, with the points eliminated (Schur complement)."""
+    matrix, lower, right = np.zeros((width, width)), np.zeros((width, width)), np.zeros(width)
+    size = by_photo.shape[2]
+    longest = 0
+    for n in range(len(ends)):
+        longest = max(longest, ends[n] - (ends[n - 1] if n else 0))
+    mixed, solved = np.zeros((longest, 3, size)), np.zeros((longest, 3, size))
+    for n in range(len(ends)):
+        first = ends[n - 1] if n else 0
+        pull = np.zeros(3)
+        for at in range(first, ends[n]):
+            rows, point, left = by_photo[order[at]], by_point[order[at]], weighed[order[at]]
+            k = at - first
+            for i in range(3):
+                pull[i] += point[0, i] * left[0] + point[1, i] * left[1]
+                for c in range(size):
+                    mixed[k, i, c] = point[0, i] * rows[0, c] + point[1, i] * rows[1, c]
+            for i in range(3):
+                for c in range(size):
+                    solved[k, i, c] = (
+                        inverse[n, i, 0] * mixed[k, 0, c]
+                        + inverse[n, i, 1] * mixed[k, 1, c]
+                        + inverse[n, i, 2] * mixed[k, 2, c]
+                    )
+        for at in range(first, ends[n]):
+            rows, left, own = by_photo[order[at]], weighed[order[at]], columns[order[at]]
+            k = at - first
+            for a in range(size):
+                right[own[a]] += rows[0, a] * left[0] + rows[1, a] * left[1]
+                for i in range(3):
+                    right[own[a]] -= solved[k, i, a] * pull[i]
+                for b in range(size):
+                    matrix[own[a], own[b]] += rows[0, a] * rows[0, b] + rows[1, a] * rows[1, b]
+            for other in range(first, at + 1):
+                h, theirs = other - first, columns[order[other]]
+                target = matrix if other == at else lower
+                for a in range(size):
+                    x, y, z = mixed[k, 0, a], mixed[k, 1, a], mixed[k, 2, a]
+                    for b in range(size):
+                        target[own[a], theirs[b]] -= x * solved[h, 0, b] + y * solved[h, 1, b] + z * solved[h, 2, b]
+    return matrix + lower + lower.T, right
 
 
 def with_covariance(sparse: SparseModel, terms: LensTerms) -> SparseModel:
@@ -296,7 +378,6 @@ def _changed(camera: Camera, focal: float, centre: Sequence[float]) -> Camera:
 
 def _moved(sparse: SparseModel, terms: LensTerms, equations: NormalEquations, step: Array) -> SparseModel:
     """The model after a step (U,) of its unknowns."""
-    solved, pull = equations.carry
     size = UNKNOWNS * len(sparse.photos)
     of_lens = step[size:].reshape(-1, 5)
     photos = []
@@ -306,5 +387,4 @@ def _moved(sparse: SparseModel, terms: LensTerms, equations: NormalEquations, st
         dist = photo.camera.dist + np.array([common[3], common[4], 0.0, 0.0, 0.0])
         camera = _changed(replace(photo.camera, dist=dist), focal, centre)
         photos.append(replace(photo, camera=camera, cam_from_scan=exp_se3(own[:6]) @ photo.cam_from_scan))
-    points = sparse.points_in_scan + (pull - solved @ step).reshape(-1, 3)
-    return replace(sparse, photos=tuple(photos), points_in_scan=points)
+    return replace(sparse, photos=tuple(photos), points_in_scan=sparse.points_in_scan + equations.rows.shifts(step))

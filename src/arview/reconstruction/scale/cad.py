@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from arview.cad import Model, Part, ViewRange
 from arview.camera import Camera
+from arview.core import subpixel_edges
 from arview.core.parallel import pool
 from arview.core.progress import Progress
-from arview.core.subpixel_edges import linear_light
 from arview.detection import Detector
 from arview.geometry import Array, invert, rigid
 from arview.guideviews import GuideViewOptions, GuideViewSet, cached_guide_views
@@ -136,7 +136,7 @@ def spread_order(photos: Sequence[PosedPhoto]) -> list[int]:
 def make_view(photo: PosedPhoto, image: Pixels, max_side_px: int) -> ScaleView:
     """A photo in linear light, with no side longer than ``max_side_px``."""
     camera, gray = shrunk(photo.camera, cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), max_side_px)
-    return ScaleView(photo.name, camera, linear_light(gray), photo.cam_from_scan)
+    return ScaleView(photo.name, camera, subpixel_edges.linear_light(gray), photo.cam_from_scan)
 
 
 def shrunk(camera: Camera, image: Pixels, max_side_px: int) -> tuple[Camera, Pixels]:

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from arview.cad import Model
 from arview.camera import Camera
+from arview.core import subpixel_edges
 from arview.core.fits import robust_sigma, tukey_weights
 from arview.core.parallel import pool
-from arview.core.subpixel_edges import choose_steps, find_steps, project_edges
 from arview.geometry import Array, apply
 from arview.reconstruction.scale.similarity import Similarity
 from arview.rendering import EDGE_SHARP, EDGE_SILHOUETTE, ZBufferRenderer, sample_visible_edges
@@ -273,10 +273,10 @@ class JointRefiner:
         With ``shift_px`` the search is beside the edges, where steps are found by chance.
         """
         _, pixels, normals, by_cam = _projected(view.camera, cam_from_model, samples.points, samples.tangents)
-        all_offsets, all_slopes, seen = find_steps(
+        all_offsets, all_slopes, seen = subpixel_edges.find_steps(
             view.gray, pixels + shift_px * normals, normals, reach_px, HALF_WIDTH_PX, THRESHOLD
         )
-        offsets, slopes = choose_steps(all_offsets, all_slopes, 0.4 * reach_px, HALF_SLOPE)
+        offsets, slopes = subpixel_edges.choose_steps(all_offsets, all_slopes, 0.4 * reach_px, HALF_SLOPE)
         is_found = seen & (slopes != 0.0)
         by_model = by_cam @ cam_from_model[:3, :3]
         rows = np.concatenate(
@@ -332,7 +332,9 @@ def _projected(
 ) -> tuple[Array, Array, Array, Array]:
     """`project_edges` of one camera."""
     lens = np.array([[camera.fx, camera.fy, camera.cx, camera.cy, *camera.dist]])
-    return project_edges(points, tangents, np.zeros(len(points), dtype=np.int64), cam_from_model[None, :3], lens)
+    return subpixel_edges.project_edges(
+        points, tangents, np.zeros(len(points), dtype=np.int64), cam_from_model[None, :3], lens
+    )
 
 
 def _mean(values: Array) -> float:
