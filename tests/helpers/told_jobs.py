@@ -133,6 +133,8 @@ class ToldJobs:
         if method == "POST":
             about = json.loads(content)
             upload = f"up-{about['sha256'][:8]}"
+            while upload in self.names:  # another photo may show just the same
+                upload += "-again"
             self.begun[upload] = about
             return 201, {"upload": upload, "offset": len(self.uploads.setdefault(upload, bytearray()))}
         upload = rest.split("/")[1]

@@ -19,6 +19,7 @@ import click
 from arview import tracking
 from arview.cli.exit_codes import ExitCode, group_rows, help_rows
 from arview.core.atomic import is_device
+from arview.core.parallel import bound_arenas
 from arview.core.plug_ins import find_plug_ins, load_plug_in
 from arview.core.progress import Progress, StepProgress, check_stop, stops_by_signals
 from arview.errors import ArviewError, CannotMeasureError, InputError, OutputError, without_credentials
@@ -139,6 +140,7 @@ class _Program(Group):
         run = partial(super().main, args, *positional, standalone_mode=False, **options)
         if not standalone_mode:
             return run()
+        bound_arenas()
         try:
             result: Any = run()
             if sys.stdout is not None:
