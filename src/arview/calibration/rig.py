@@ -208,12 +208,14 @@ def rig_from_part(shots: Sequence[Shot], cameras: Mapping[str, Camera], part: Pa
     """The rig from the part itself: each camera sees it in every shot, best at several places.
 
     Raises:
-        InputError: the part is not found in the picture of a camera; the message names it.
+        InputError: the part is not found in the picture of a camera, or Brown's terms do not describe its lens; the
+            message names it.
     """
-    found = reconstruction.cameras_from_part(shots, cameras, part)
+    lenses = {name: require_brown(camera, name) for name, camera in cameras.items()}
+    found = reconstruction.cameras_from_part(shots, lenses, part)
     return CameraRig(
-        tuple(cameras),
-        tuple(cameras.values()),
+        tuple(lenses),
+        tuple(lenses.values()),
         found.cams_from_rig,
         found.covariance,
         found.scale_std,

@@ -43,7 +43,7 @@ def _blas() -> ThreadpoolController:
 def bound_arenas() -> None:
     """Let all threads, and those of child processes, allocate from a few arenas.
 
-    glibc makes up to eight for each core, and what was freed in one stays there: a hundred megabytes of a live page.
+    glibc makes up to eight for each core, and memory that was freed in one of them is not used by the others.
     """
     if "MALLOC_ARENA_MAX" in os.environ:
         return

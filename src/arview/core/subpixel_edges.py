@@ -111,11 +111,11 @@ def find_steps(
     profile = np.empty(size, dtype=np.float32)
     slope = np.zeros(size, dtype=np.float32)
     margin = half * STEP_PX + half_width_px + 1.0
-    right, below = np.uint64(1), np.uint64(width)  # unsigned: numba would look whether an index is negative
+    right, below = np.uint64(1), np.uint64(width)  # unsigned, so that numba need not look for negative indices
     per_px = np.float32(0.1 / STEP_PX)
     for i in range(count):
         u, v, nu, nv = pixels[i, 0], pixels[i, 1], normals[i, 0], normals[i, 1]
-        if not (u > margin and v > margin and u < width - 2 - margin and v < height - 2 - margin and abs(nu) <= 1.0):
+        if not (u > margin and v > margin and u < width - 2 - margin and v < height - 2 - margin and np.isfinite(nu)):
             continue
         seen[i] = True
         # From a pixel left of and above all samples, so that single precision suffices.

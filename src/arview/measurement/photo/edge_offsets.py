@@ -178,11 +178,11 @@ def _crop(
     views: PhotoViews, view: int, level: int, pixels: Array, reach_px: float
 ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
     """A photo, or the part of a large one around some pixels, in linear light, and its first pixel (u, v)."""
-    width, height = views.levels[level].sizes[view]
-    margin = reach_px + 12.0
     whole = views.linear(view, level)
     if whole is not None:
         return whole, np.zeros(2, dtype=np.int64)
+    width, height = views.levels[level].sizes[view]
+    margin = reach_px + 12.0
     pixels = pixels[np.isfinite(pixels).all(axis=1)]
     low = np.clip(np.floor(pixels.min(axis=0, initial=0.0 if not len(pixels) else np.inf) - margin), 0, [width, height])
     high = np.clip(np.ceil(pixels.max(axis=0, initial=0.0) + margin), 0, [width, height])

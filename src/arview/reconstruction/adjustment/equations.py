@@ -147,21 +147,21 @@ def normal_equations(sparse: SparseModel, terms: LensTerms) -> NormalEquations:
         columns, by_photo = np.concatenate([columns, own], axis=1), np.concatenate([by_photo, by_lens], axis=2)
     weighed = roots[:, None] * residuals
     order = np.argsort(sparse.observed_point, kind="stable")
-    ends = np.cumsum(np.bincount(sparse.observed_point, minlength=count))
-    inverse: Array = np.asarray(np.linalg.pinv(_point_blocks(order, ends, by_point), hermitian=True), np.float64)
-    matrix, right = _without_points(order, ends, by_point, by_photo, columns, weighed, inverse, width)
+    starts = np.searchsorted(sparse.observed_point[order], np.arange(count + 1))
+    inverse: Array = np.asarray(np.linalg.pinv(_point_blocks(order, starts, by_point), hermitian=True), np.float64)
+    matrix, right = _without_points(order, starts, by_point, by_photo, columns, weighed, inverse, width)
     rows = PointRows(sparse.observed_point, by_point, by_photo, columns, weighed, inverse)
     return NormalEquations(matrix, right, rows)
 
 
 @kernel
 def _point_blocks(
-    order: NDArray[np.int64], ends: NDArray[np.int64], by_point: NDArray[np.float64]
+    order: NDArray[np.int64], starts: NDArray[np.int64], by_point: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """(N,3,3) information of each point by its observations, which are those of ``order`` up to its end."""
-    blocks = np.zeros((len(ends), 3, 3))
-    for n in range(len(ends)):
-        for at in range(ends[n - 1] if n else 0, ends[n]):
+    """(N,3,3) information of each point by its observations, which begin at its place in ``starts`` (N+1,)."""
+    blocks = np.zeros((len(starts) - 1, 3, 3))
+    for n in range(len(blocks)):
+        for at in range(starts[n], starts[n + 1]):
             rows = by_point[order[at]]
             for i in range(3):
                 for j in range(3):
@@ -172,7 +172,7 @@ def _point_blocks(
 @kernel
 def _without_points(
     order: NDArray[np.int64],
-    ends: NDArray[np.int64],
+    starts: NDArray[np.int64],
     by_point: NDArray[np.float64],
     by_photo: NDArray[np.float64],
     columns: NDArray[np.int64],
@@ -184,13 +184,13 @@ def _without_points(
     matrix, lower, right = np.zeros((width, width)), np.zeros((width, width)), np.zeros(width)
     size = by_photo.shape[2]
     longest = 0
-    for n in range(len(ends)):
-        longest = max(longest, ends[n] - (ends[n - 1] if n else 0))
+    for n in range(len(inverse)):
+        longest = max(longest, starts[n + 1] - starts[n])
     mixed, solved = np.zeros((longest, 3, size)), np.zeros((longest, 3, size))
-    for n in range(len(ends)):
-        first = ends[n - 1] if n else 0
+    for n in range(len(inverse)):
+        first, end = starts[n], starts[n + 1]
         pull = np.zeros(3)
-        for at in range(first, ends[n]):
+        for at in range(first, end):
             rows, point, left = by_photo[order[at]], by_point[order[at]], weighed[order[at]]
             k = at - first
             for i in range(3):
@@ -204,7 +204,7 @@ def _without_points(
                         + inverse[n, i, 1] * mixed[k, 1, c]
                         + inverse[n, i, 2] * mixed[k, 2, c]
                     )
-        for at in range(first, ends[n]):
+        for at in range(first, end):
             rows, left, own = by_photo[order[at]], weighed[order[at]], columns[order[at]]
             k = at - first
             for a in range(size):
