@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 
 from arview.calibration import CameraRig, rig_from_board, rig_from_part
 from arview.calibration.verdict import Grade
+from arview.camera import LensDistortion, LensModel
 from arview.errors import InputError
 from arview.geometry import Array, exp_se3, invert, log_se3
 from helpers.rig_cell import BOARD, CAMERA, Cell, board_shots, cell, names_of, write_pictures
@@ -96,3 +98,12 @@ def test_the_part_places_the_cameras_within_their_u(tmp_path: Path) -> None:
 
         cv2.imwrite(str(blank["cam_1"]), np.full((CAMERA.height, CAMERA.width), 90, dtype=np.uint8))
         rig_from_part([blank], LENSES, SCENE.part)
+
+
+def test_a_lens_that_is_not_browns_is_refused() -> None:
+    fisheye = replace(
+        CAMERA, fx=600.0, fy=600.0, dist=np.zeros(5), lens=LensDistortion(LensModel.FISHEYE, (0.05, 0.01))
+    )
+    shot = {name: Path(f"{name}.png") for name in LENSES}
+    with pytest.raises(InputError, match="cam_2: the lens model fisheye"):
+        rig_from_part([shot], {**LENSES, "cam_2": fisheye}, SCENE.part)
